@@ -1,0 +1,1 @@
+"""Value-aligned world models in JAX."""

@@ -1,0 +1,219 @@
+"""Every choice of a run, as frozen dataclasses; presets are values of them.
+
+Numbers are Table 15 of the paper unless their comment names another source. Nothing here
+imports the rest of the package. Factories read these; losses only ever receive numbers.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+
+@dataclass(frozen=True)
+class WorldModelConfig:
+    """RSSM of DreamerV3 with block GRU; widths default to size 12m."""
+
+    deter: int = 2048
+    """width of h"""
+    hidden: int = 256
+    """width of the layers around h"""
+    stoch: int = 32
+    """number of categoricals in z"""
+    classes: int = 16
+    """classes of each categorical"""
+    units: int = 256
+    """width of encoder, decoder, reward and continue layers"""
+    blocks: int = 8
+    """blocks of the block-diagonal GRU"""
+    dynamics_layers: int = 1
+    prior_layers: int = 2
+    posterior_layers: int = 1
+    encoder_layers: int = 3
+    decoder_layers: int = 3
+    reward_layers: int = 1
+    continue_layers: int = 1
+    bins: int = 255
+    """bins of the symexp two-hot reward"""
+    unimix: float = 0.01
+    """uniform share mixed into prior and posterior"""
+    free_nats: float = 1.0
+    reconstruction_scale: float = 1.0
+    dynamics_scale: float = 1.0
+    representation_scale: float = 0.1
+
+
+@dataclass(frozen=True)
+class ActorConfig:
+    layers: int = 3
+    units: int = 256
+    unimix: float = 0.01
+    """uniform share of a discrete policy"""
+    min_std: float = 0.1
+    max_std: float = 1.0
+    scale: float = 1.0
+    entropy_scale: float = 1e-3
+    """Table 15; public DreamerV3 codes use 3e-4"""
+
+
+@dataclass(frozen=True)
+class CriticConfig:
+    layers: int = 3
+    units: int = 256
+    bins: int = 255
+    scale: float = 1.0
+    slow_rate: float = 0.02
+    """1 - EMA decay of the slow critic"""
+    slow_scale: float = 1.0
+    """weight of the slow critic as a regulariser"""
+    replay_scale: float = 0.3
+    """weight of the replay value loss"""
+    replay_gradient: bool = True
+    """whether the replay value loss reaches the world model, as in the official code"""
+
+
+@dataclass(frozen=True)
+class ImaginationConfig:
+    horizon: int = 15
+    lambda_: float = 0.95
+    discount_horizon: float = 333.0
+    """gamma = 1 - 1 / discount_horizon"""
+    return_scale_decay: float = 0.99
+    return_scale_limit: float = 1.0
+    return_scale_low: float = 0.05
+    return_scale_high: float = 0.95
+
+
+@dataclass(frozen=True)
+class ValueAlignmentConfig:
+    """L_var, Eq. 4 and Eq. 5. The loss and its weight are logged even when off."""
+
+    weight: Literal["adaptive", "static", "off"] = "adaptive"
+    """adaptive: 1 / max(1, KL), Eq. 5"""
+    static_weight: float = 0.5
+    """used by weight="static"; Table 3"""
+    warmup_steps: int = 10_000
+    """weight 0 up to and including this step"""
+    warmup_unit: Literal["env_steps", "updates"] = "env_steps"
+    dynamics_scale: float = 0.5
+    """on KL[sg V(s) || V(s~)]"""
+    representation_scale: float = 0.1
+    """on KL[V(s) || sg V(s~)]; 0 gives the gradient of Eq. 4 as printed"""
+    critic: Literal["online", "slow"] = "online"
+    deter_gradient: Literal["live", "stop"] = "live"
+    """whether L_var reaches h_t through the critic's input"""
+    noise: Literal["independent", "shared"] = "independent"
+    """sampling noise of z~ against that of z"""
+
+
+@dataclass(frozen=True)
+class OptimizerConfig:
+    """LaProp after per-tensor adaptive gradient clipping, for all parameters at once."""
+
+    learning_rate: float = 4e-5
+    warmup_updates: int = 1000
+    agc: float = 0.3
+    agc_floor: float = 1e-3
+    """smallest parameter norm that AGC assumes"""
+    beta1: float = 0.9
+    beta2: float = 0.999
+    epsilon: float = 1e-20
+
+
+@dataclass(frozen=True)
+class ReplayConfig:
+    capacity: int = 5_000_000
+    """steps of all environments together; never more than the run collects is allocated"""
+    batch_size: int = 16
+    batch_length: int = 64
+
+
+@dataclass(frozen=True)
+class Config:
+    """One run. `env_steps` counts control steps, action repeat included."""
+
+    task: str = "cartpole_swingup"
+    preset: str = "paper"
+    size: str = "12m"
+    seed: int = 0
+    env_steps: int = 500_000
+    num_envs: int = 16
+    action_repeat: int = 2
+    train_ratio: int = 512
+    """replayed steps per collected step; updates = train_ratio / (batch_size * batch_length)"""
+    collect_steps: int = 1
+    """steps in every environment between updates, inside one jitted call"""
+    compute_dtype: Literal["auto", "float32", "bfloat16"] = "auto"
+    """auto: bfloat16 on GPU and TPU, float32 on CPU"""
+    log_every: int = 2_000
+    """env steps between lines of metrics.jsonl"""
+    save_every: int = 50_000
+    """env steps between checkpoints"""
+    world_model: WorldModelConfig = field(default_factory=WorldModelConfig)
+    actor: ActorConfig = field(default_factory=ActorConfig)
+    critic: CriticConfig = field(default_factory=CriticConfig)
+    imagination: ImaginationConfig = field(default_factory=ImaginationConfig)
+    value_alignment: ValueAlignmentConfig = field(default_factory=ValueAlignmentConfig)
+    optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
+    replay: ReplayConfig = field(default_factory=ReplayConfig)
+
+
+@dataclass(frozen=True)
+class Size:
+    """Widths of one model size; the other numbers do not change with size."""
+
+    deter: int
+    hidden: int
+    classes: int
+    units: int
+
+
+SIZES = {
+    "1m": Size(deter=512, hidden=64, classes=4, units=64),
+    "12m": Size(deter=2048, hidden=256, classes=16, units=256),
+    "25m": Size(deter=3072, hidden=384, classes=24, units=384),
+    "50m": Size(deter=4096, hidden=512, classes=32, units=512),
+    "100m": Size(deter=6144, hidden=768, classes=48, units=768),
+    "200m": Size(deter=8192, hidden=1024, classes=64, units=1024),
+    "400m": Size(deter=12288, hidden=1536, classes=96, units=1536),
+}
+
+
+def with_size(config: Config, size: str) -> Config:
+    """`config` with the widths of `SIZES[size]`."""
+    widths = SIZES[size]
+    return dataclasses.replace(
+        config,
+        size=size,
+        world_model=dataclasses.replace(
+            config.world_model,
+            deter=widths.deter,
+            hidden=widths.hidden,
+            classes=widths.classes,
+            units=widths.units,
+        ),
+        actor=dataclasses.replace(config.actor, units=widths.units),
+        critic=dataclasses.replace(config.critic, units=widths.units),
+    )
+
+
+PAPER = Config()
+
+QUICK = dataclasses.replace(
+    with_size(PAPER, "1m"),
+    preset="quick",
+    env_steps=30_000,
+    num_envs=4,
+    collect_steps=4,
+    log_every=1_000,
+    save_every=10_000,
+    value_alignment=ValueAlignmentConfig(warmup_steps=3_000),
+)
+
+PRESETS = {"quick": QUICK, "paper": PAPER}
+
+
+def as_dict(config: Config) -> dict[str, Any]:
+    """Plain nested dict, ready for JSON."""
+    return dataclasses.asdict(config)

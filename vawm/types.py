@@ -1,0 +1,119 @@
+"""The data of the package: every array lives in one of these NamedTuples.
+
+Time, once and for all. Everything at index t *arrived with* observation o_t; the action
+a_t leaves from it:
+
+    index            t                          t + 1
+    arrives      o_t, r_t, flags_t   ->     o_{t+1}, r_{t+1}, flags_{t+1}
+    leaves              a_t  ----------------^
+    latent       s_t = (h_t, z_t)           h_{t+1} = f(h_t, z_t, a_t)
+
+So r_{t+1} is the reward *of* a_t, and the reward head reads it from s_{t+1}.
+Shapes are `[B, T, ...]` for experience (replay order) and `[H, N, ...]` for imagination
+(scan order). Actions are float arrays `[..., action_size]`; discrete ones are one-hot.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+
+Array = jax.Array
+Key = jax.Array
+PyTree = Any
+Metrics = dict[str, jax.Array]
+
+
+class EnvSpec(NamedTuple):
+    """What an agent has to know of an environment; all static.
+
+    Attributes:
+      task: name of the task, such as "walker_walk".
+      obs_shape: shape of one observation, without batch.
+      obs_dtype: "float32" for vectors, "uint8" for images.
+      action_size: width of the action vector, or number of discrete actions.
+      discrete: whether actions are one-hot choices.
+      num_envs: N, environments stepped at once.
+      action_repeat: control steps per call of `step`.
+      episode_length: calls of `step` in one full episode; None where it varies.
+    """
+
+    task: str
+    obs_shape: tuple[int, ...]
+    obs_dtype: str
+    action_size: int
+    discrete: bool
+    num_envs: int
+    action_repeat: int
+    episode_length: int | None
+
+
+class TimeStep(NamedTuple):
+    """What arrives with o_t, for N environments.
+
+    `is_last` ends an episode for any reason, `is_terminal` only where the return truly
+    ends (no bootstrap). The step after `is_last` is a reset: its action is ignored, its
+    reward is 0 and it carries `is_first`.
+    """
+
+    obs: Array  # [N, *obs_shape]
+    reward: Array  # [N] float32
+    is_first: Array  # [N] bool
+    is_last: Array  # [N] bool
+    is_terminal: Array  # [N] bool
+
+
+class Trajectory(NamedTuple):
+    """A `TimeStep` and the raw action that left from it, `[B, T, ...]`."""
+
+    obs: Array
+    reward: Array
+    is_first: Array
+    is_last: Array
+    is_terminal: Array
+    action: Array  # [B, T, action_size], as sampled, before any clipping
+
+
+class Latent(NamedTuple):
+    """s_t = (h_t, z_t)."""
+
+    deter: Array  # [..., D]
+    stoch: Array  # [..., S, K] one-hot, straight-through
+
+
+class Inference(NamedTuple):
+    """What a world model infers from a batch, `[B, T, ...]`.
+
+    `latent` and `prior_latent` share h_t; their z_t is drawn from q(z|h,o) and p(z|h).
+    Logits are before unimix. `has_prior` is False where no prediction of z_t exists.
+    """
+
+    latent: Latent
+    prior_latent: Latent
+    post_logits: Array  # [B, T, S, K]
+    prior_logits: Array  # [B, T, S, K]
+    has_prior: Array  # [B, T] bool
+
+
+class Imagined(NamedTuple):
+    """A rollout in imagination: `latent[k + 1]` follows `action[k]` at `latent[k]`."""
+
+    latent: Latent  # [H + 1, N, ...]
+    action: Array  # [H, N, action_size]
+
+
+class Predictions(NamedTuple):
+    """What the heads read from a latent, any leading dims."""
+
+    obs: Array  # [..., *obs_shape], in symlog units for vectors
+    reward: Array  # [..., bins] logits of the symexp two-hot
+    cont: Array  # [...] logit of discount * P(not terminal)
+
+
+class Params(NamedTuple):
+    """All that is learned by gradient."""
+
+    world_model: PyTree
+    actor: PyTree
+    critic: PyTree
