@@ -27,9 +27,7 @@ class WorldModelConfig:
     """width of encoder, decoder, reward and continue layers"""
     blocks: int = 8
     """blocks of the block-diagonal GRU"""
-    dynamics_layers: int = 1
     prior_layers: int = 2
-    posterior_layers: int = 1
     encoder_layers: int = 3
     decoder_layers: int = 3
     reward_layers: int = 1

@@ -1,0 +1,37 @@
+"""The losses, arrays in and arrays out: no network, environment or configuration.
+
+Equation numbers are the paper's. Every loss is per element; masks, weights and means are the
+caller's.
+
+    prediction_loss, symlog_mse, image_mse, continue_loss     Eq. 3a  what the heads predict
+    dynamics_loss                                             Eq. 3b  prior and posterior
+    value_alignment_loss                                      Eq. 4   values under both
+    value_alignment_weight                                    Eq. 5   its adaptive weight
+    critic_loss                                               Eq. 7   towards lambda-returns
+    actor_loss, discount_weights                              Eq. 8   policy gradient
+"""
+
+from vawm.losses.behaviour import actor_loss, critic_loss, discount_weights
+from vawm.losses.likelihood import (
+    PredictionLoss,
+    continue_loss,
+    dynamics_loss,
+    image_mse,
+    prediction_loss,
+    symlog_mse,
+)
+from vawm.losses.value_alignment import value_alignment_loss, value_alignment_weight
+
+__all__ = [
+    "PredictionLoss",
+    "actor_loss",
+    "continue_loss",
+    "critic_loss",
+    "discount_weights",
+    "dynamics_loss",
+    "image_mse",
+    "prediction_loss",
+    "symlog_mse",
+    "value_alignment_loss",
+    "value_alignment_weight",
+]

@@ -1,0 +1,8 @@
+"""The DeepMind Control Suite's proprio tasks on MJX, one module per domain."""
+
+import contextlib
+import io
+
+# On import mjx prints that its optional CUDA backend is missing; stdout belongs to the user.
+with contextlib.redirect_stdout(io.StringIO()):
+    import mujoco.mjx  # noqa: F401

@@ -1,0 +1,191 @@
+"""How fast is one update? A synthetic batch, value alignment on and off in turn.
+
+    python experiments/benchmark.py --size 1m --json
+
+Prints medians over repeated runs after a warm-up; absolute times depend on the machine,
+ratios within one run are to be trusted. "off" drops value alignment from the compiled
+program altogether, its metrics included, so it is plain DreamerV3.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import resource
+import statistics
+import time
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import tyro
+
+from vawm import envs, train
+from vawm.agent import make_agent, parameter_count
+from vawm.config import PAPER, SIZES, Config, ValueAlignmentConfig, with_size
+from vawm.errors import InvalidInput
+from vawm.types import EnvSpec, Latent, Trajectory
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """Time the update, its compilation, and stepping environments with the policy."""
+
+    size: str = "1m"
+    """model size"""
+    batch_size: int = 16
+    batch_length: int = 64
+    observations: int = 24
+    actions: int = 6
+    repeats: int = 8
+    """timed updates of each kind"""
+    compute_dtype: str = "auto"
+    task: str = "cartpole_swingup"
+    """environment for env_steps_per_s"""
+    num_envs: int = 16
+    env_calls: int = 100
+    """steps of every environment in the timed collection"""
+    json: bool = False
+    """print one JSON object and nothing else"""
+
+
+def make_config(options: Benchmark) -> Config:
+    if options.size not in SIZES:
+        raise InvalidInput("size", options.size, f"choose one of {', '.join(SIZES)}")
+    for field in (
+        "batch_size",
+        "batch_length",
+        "observations",
+        "actions",
+        "repeats",
+        "env_calls",
+    ):
+        if getattr(options, field) < 1:
+            raise InvalidInput(field, getattr(options, field), "give a positive number")
+    return dataclasses.replace(
+        with_size(PAPER, options.size),
+        compute_dtype=options.compute_dtype,
+        num_envs=options.num_envs,
+        action_repeat=1,
+        env_steps=options.num_envs * options.env_calls,
+        collect_steps=options.env_calls,
+        replay=dataclasses.replace(
+            PAPER.replay, batch_size=options.batch_size, batch_length=options.batch_length
+        ),
+        value_alignment=ValueAlignmentConfig(warmup_steps=0),
+    )
+
+
+def synthetic_batch(options: Benchmark, config: Config, latent: Latent) -> train.Batch:
+    shape = options.batch_size, options.batch_length + 1
+    key_obs, key_action, key_reward = jax.random.split(jax.random.key(0), 3)
+    flags = jnp.zeros(shape, bool)
+    trajectory = Trajectory(
+        obs=jax.random.normal(key_obs, (*shape, options.observations)),
+        reward=jax.random.uniform(key_reward, shape),
+        is_first=flags,
+        is_last=flags,
+        is_terminal=flags,
+        action=jax.random.normal(key_action, (*shape, options.actions)),
+    )
+    return train.Batch(trajectory, latent)
+
+
+class TimedUpdate:
+    """One compiled variant of the update and the learner that it advances."""
+
+    def __init__(self, agent, config: Config, batch: train.Batch, aligned: bool):
+        update = train.make_update(agent, config)
+
+        def step(learner, batch, key):
+            learner, latent, metrics = update(learner, batch, key, jnp.ones((), jnp.int32))
+            kept = {k: v for k, v in metrics.items() if aligned or "alignment" not in k}
+            return learner, latent, kept
+
+        self.batch, self.seconds, self.key = batch, [], jax.random.key(1)
+        init = jax.jit(lambda key: train.init_learner(agent, config, key))
+        self.learner = init(jax.random.key(0))
+        begin = time.perf_counter()
+        self.step = (
+            jax.jit(step, donate_argnums=0).lower(self.learner, batch, self.key).compile()
+        )
+        self.compile_seconds = time.perf_counter() - begin
+
+    def run(self) -> None:
+        begin = time.perf_counter()
+        self.learner, _, metrics = self.step(self.learner, self.batch, self.key)
+        jax.block_until_ready((self.learner, metrics))
+        self.seconds.append(time.perf_counter() - begin)
+
+
+def env_steps_per_s(options: Benchmark, config: Config) -> float:
+    """Control steps a second of collection: acting, physics and storing, no learning."""
+    env = envs.make(options.task, num_envs=options.num_envs, action_repeat=1)
+    agent = make_agent(config, env.spec)
+    state = train.init(env, agent, config, jax.random.key(0))
+    collect = jax.jit(train.make_collect(env, agent, config))
+    seconds = []
+    for _ in range(4):
+        begin = time.perf_counter()
+        jax.block_until_ready(
+            collect(state.learner.params, state.collector, state.replay, state.key)
+        )
+        seconds.append(time.perf_counter() - begin)
+    return options.num_envs * options.env_calls / statistics.median(seconds[1:])
+
+
+def run(options: Benchmark) -> dict:
+    config = make_config(options)
+    spec = EnvSpec(
+        "synthetic", (options.observations,), "float32", options.actions, False, 1, 1, None
+    )
+    agent = make_agent(config, spec)
+    batch = synthetic_batch(options, config, agent.world_model.initial(options.batch_size))
+    plain = dataclasses.replace(
+        config, value_alignment=dataclasses.replace(config.value_alignment, weight="off")
+    )
+    on = TimedUpdate(agent, config, batch, aligned=True)
+    for _ in range(2):
+        on.run()
+    peak_rss_gb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    off = TimedUpdate(agent, plain, batch, aligned=False)
+    for _ in range(2):
+        off.run()
+    on.seconds, off.seconds = [], []
+    for _ in range(options.repeats):
+        on.run()
+        off.run()
+    overhead = statistics.median(a / b for a, b in zip(on.seconds, off.seconds, strict=True))
+    return {
+        "size": options.size,
+        "params": parameter_count(on.learner.params),
+        "device": jax.devices()[0].device_kind,
+        "batch": [options.batch_size, options.batch_length],
+        "update_s_median": statistics.median(on.seconds),
+        "update_s_min": min(on.seconds),
+        "update_s_median_off": statistics.median(off.seconds),
+        "overhead_percent": 100 * (overhead - 1),
+        "compile_s": on.compile_seconds,
+        "peak_rss_gb": peak_rss_gb,
+        "env_steps_per_s": env_steps_per_s(options, config),
+        "env_task": options.task,
+        "num_envs": options.num_envs,
+    }
+
+
+def main() -> None:
+    options = tyro.cli(Benchmark, description=__doc__)
+    jax.config.update("jax_enable_compilation_cache", False)  # compile_s is a cold figure
+    try:
+        result = run(options)
+    except InvalidInput as error:
+        raise SystemExit(f"error: {error}") from None
+    if options.json:
+        print(json.dumps(result))
+    else:
+        for name, value in result.items():
+            print(f"{name:>20}  {value}")
+
+
+if __name__ == "__main__":
+    main()

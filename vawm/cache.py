@@ -1,0 +1,44 @@
+"""JAX's persistent compilation cache, on by default: the second start compiles nothing.
+
+The folder is `$JAX_COMPILATION_CACHE_DIR`, else `$XDG_CACHE_HOME/vawm/jax`, else
+`~/.cache/vawm/jax`; `VAWM_NO_CACHE=1` switches the cache off.
+"""
+
+from __future__ import annotations
+
+import os
+import pathlib
+
+import jax
+
+MIN_COMPILE_SECONDS = 0.5
+
+
+def folder() -> pathlib.Path:
+    """Where compiled functions are kept."""
+    explicit = os.environ.get("JAX_COMPILATION_CACHE_DIR")
+    if explicit:
+        return pathlib.Path(explicit).expanduser()
+    base = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    return pathlib.Path(base).expanduser() / "vawm" / "jax"
+
+
+def enable() -> pathlib.Path | None:
+    """Turns the cache on; a folder that cannot be written leaves it off, never an error.
+
+    Returns:
+      The folder in use, or None where the cache is off.
+    """
+    if os.environ.get("VAWM_NO_CACHE", "") not in ("", "0"):
+        jax.config.update("jax_enable_compilation_cache", False)
+        return None
+    try:
+        path = folder()
+        path.mkdir(parents=True, exist_ok=True)
+    except (OSError, RuntimeError):  # RuntimeError: no home to expand "~" to
+        return None
+    if not os.access(path, os.W_OK | os.X_OK):
+        return None
+    jax.config.update("jax_compilation_cache_dir", str(path))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", MIN_COMPILE_SECONDS)
+    return path

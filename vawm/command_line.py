@@ -1,0 +1,124 @@
+"""The command line of experiments: tyro over `Config`, two phases, one line per error.
+
+`--preset` and `--size` choose the defaults, or `--resume` takes those of the saved run;
+every other flag then overrides one field of `Config`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import datetime
+import pathlib
+import sys
+from collections.abc import Callable, Sequence
+from typing import Annotated
+
+import tyro
+
+from vawm import checkpoint, validate
+from vawm import config as config_lib
+from vawm.checkpoint import SaveError
+from vawm.config import Config
+from vawm.errors import InvalidInput
+from vawm.runner import RunError
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """What a command line says."""
+
+    config: Annotated[Config, tyro.conf.arg(name="")]
+    logdir: pathlib.Path = pathlib.Path()
+    """folder of the run (default: runs/<task>/<preset>-seed<seed>-<time>)"""
+    resume: bool = False
+    """continue the run in --logdir, with its own settings as defaults"""
+
+
+def parse(argv: Sequence[str] | None, *, preset: str, description: str) -> Arguments:
+    """Reads `argv` (of the process if None); `preset` is the default one.
+
+    Raises:
+      InvalidInput: an unknown preset or size, or nothing to resume.
+      SystemExit: help was asked for (0), or a flag is unknown or of the wrong type (2).
+    """
+    argv = list(sys.argv[1:] if argv is None else argv)
+    arguments = tyro.cli(
+        Arguments,
+        args=argv,
+        default=Arguments(_defaults(argv, preset)),
+        description=description,
+    )
+    if arguments.logdir == pathlib.Path():
+        arguments = dataclasses.replace(arguments, logdir=default_logdir(arguments.config))
+    return arguments
+
+
+def _defaults(argv: list[str], preset: str) -> Config:
+    """First phase: the config that the flags of the second override."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--preset", nargs="?")
+    parser.add_argument("--size", nargs="?")
+    parser.add_argument("--logdir", nargs="?")
+    parser.add_argument("--resume", action=argparse.BooleanOptionalAction)
+    known, _ = parser.parse_known_args(argv)
+    if not known.resume or {"-h", "--help"} & set(argv):
+        return validate.preset(known.preset or preset, known.size)
+    if known.logdir is None:
+        raise InvalidInput("logdir", None, "--resume needs the --logdir of the run")
+    saved = checkpoint.read_manifest(known.logdir)[1].config
+    if known.preset not in (None, saved.preset):
+        return validate.preset(known.preset, known.size)
+    if known.size not in (None, saved.size):
+        validate.check_choice("size", known.size, config_lib.SIZES)
+        return config_lib.with_size(saved, known.size)
+    return saved
+
+
+def default_logdir(config: Config) -> pathlib.Path:
+    """A folder of its own for each run."""
+    now = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
+    return pathlib.Path("runs") / config.task / f"{config.preset}-seed{config.seed}-{now}"
+
+
+def describe(config: Config) -> str:
+    """What the chosen preset is for, in a few lines."""
+    alignment = config.value_alignment
+    head = (
+        f"preset {config.preset}: {config.task}, {config.env_steps:,} env steps, "
+        f"size {config.size}, seed {config.seed}"
+    )
+    unit = alignment.warmup_unit.replace("_", " ")
+    start = f"after {alignment.warmup_steps:,} {unit}"
+    if alignment.weight == "off":
+        start = "off"
+    paper = config_lib.PAPER
+    if config.preset != "quick":
+        return f"{head}\nvalue alignment: {start}"
+    return (
+        f"{head}\n"
+        "  for a CPU with 2 cores and some minutes; this is not the paper's setting\n"
+        f"  value alignment: {start}, a warm-up scaled to the short run "
+        f"(paper: {paper.value_alignment.warmup_steps:,} of {paper.env_steps:,})\n"
+        f"  the paper's setting: --preset paper ({paper.env_steps:,} env steps, "
+        f"size {paper.size}, better on a GPU)"
+    )
+
+
+def guard(main: Callable[[], int]) -> int:
+    """The exit code of `main`; what can go wrong becomes one line on standard error.
+
+    Returns:
+      2 for bad input, 1 for a run that had to stop, 130 after Ctrl-C, else main's own.
+    """
+    try:
+        return main()
+    except InvalidInput as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except (RunError, SaveError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("interrupted before the first step", file=sys.stderr)
+        return 130

@@ -1,0 +1,28 @@
+"""Gymnasium ids "vawm/<task>-v0": strings only, nothing of MuJoCo or JAX is imported."""
+
+from __future__ import annotations
+
+import gymnasium
+
+from vawm.envs import TASKS
+
+
+def register() -> None:
+    """Registers the 18 tasks, single and vectorised; a second call changes nothing.
+
+    Episodes end in the environment itself, so there is no `max_episode_steps` and no
+    TimeLimit wrapper. `action_repeat` is a keyword of `gymnasium.make` and `make_vec`.
+    """
+    for task in TASKS:
+        if env_id(task) not in gymnasium.registry:
+            gymnasium.register(
+                env_id(task),
+                entry_point="vawm.envs.gym:SingleEnv",
+                vector_entry_point="vawm.envs.gym:BatchedEnv",
+                kwargs={"task": task},
+            )
+
+
+def env_id(task: str) -> str:
+    """The Gymnasium id of a task."""
+    return f"vawm/{task}-v0"

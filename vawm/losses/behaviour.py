@@ -1,0 +1,74 @@
+"""Learning behaviour in imagination: critic towards returns, actor towards advantage."""
+
+from __future__ import annotations
+
+import chex
+import jax
+import jax.numpy as jnp
+
+from vawm.transforms import two_hot_cross_entropies
+
+Array = jax.Array
+
+
+def critic_loss(
+    value_logits: Array,
+    slow_value: Array,
+    returns: Array,
+    *,
+    bins: Array,
+    slow_scale: float,
+) -> Array:
+    """Distributional value loss, Eq. 7, with the slow critic as a regulariser.
+
+        L = CE(V(s), twohot(R)) + slow_scale * CE(V(s), twohot(v_slow))
+
+    The second target is the slow critic's mean, encoded again, as in the official DreamerV3.
+
+    Args:
+      value_logits: `[..., bins]` critic logits at s_t.
+      slow_value: `[...]` mean of the slow critic at s_t, in environment units.
+      returns: `[...]` lambda-returns R_t, in environment units, not normalised.
+      bins: `[bins]` of the critic.
+      slow_scale: weight of the regulariser.
+
+    Returns:
+      `[...]` losses in nats. Both targets are stopped.
+    """
+    to_returns, to_slow = two_hot_cross_entropies(value_logits, (returns, slow_value), bins)
+    return to_returns + slow_scale * to_slow
+
+
+def actor_loss(
+    log_prob: Array, entropy: Array, advantage: Array, *, entropy_scale: float
+) -> Array:
+    """REINFORCE with an entropy bonus, Eq. 8, for discrete and continuous actions alike.
+
+        L = -(sg(A) * log pi(a | s) + entropy_scale * H[pi(. | s)])
+
+    Args:
+      log_prob: `[...]` of the imagined action, summed over action dims.
+      entropy: `[...]` of the policy at the same state, summed over action dims.
+      advantage: `[...]` (R_t - v_t) / S. Its gradient is stopped.
+      entropy_scale: weight of the bonus.
+
+    Returns:
+      `[...]` losses.
+    """
+    chex.assert_equal_shape([log_prob, entropy, advantage])
+    return -(jax.lax.stop_gradient(advantage) * log_prob + entropy_scale * entropy)
+
+
+def discount_weights(cont: Array) -> Array:
+    """Probability that each imagined state is reached, discounted: w_t = prod_{i<=t} c_i.
+
+    c_0, predicted at the replayed start, is included: a rollout from a terminal state weighs
+    nothing.
+
+    Args:
+      cont: `[H, ...]` gamma * P(continue) at s_0..s_{H-1}, in [0, 1].
+
+    Returns:
+      `[H, ...]` weights in [0, 1], without gradient.
+    """
+    return jnp.cumprod(jax.lax.stop_gradient(cont), axis=0)

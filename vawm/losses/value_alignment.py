@@ -1,0 +1,65 @@
+"""Value alignment: make the predicted state worth what the inferred state is worth."""
+
+from __future__ import annotations
+
+import chex
+import jax
+import jax.numpy as jnp
+
+from vawm.transforms import categorical_kl
+
+Array = jax.Array
+
+
+def value_alignment_loss(
+    value_logits: Array,
+    prior_value_logits: Array,
+    *,
+    dynamics_scale: float,
+    representation_scale: float,
+) -> Array:
+    """Divergence of the value distributions at s_t and at its prediction s~_t, Eq. 4.
+
+        L = dynamics_scale * KL[sg V(s) || V(s~)] + representation_scale * KL[V(s) || sg V(s~)]
+
+    s = (h, z) with z from the posterior and s~ = (h, z~) with z~ from the prior. The paper
+    prints a stop-gradient on both arguments of the second term, which leaves it without a
+    gradient; as in its Eq. 3 we stop only the prediction. `representation_scale=0` gives the
+    gradient as printed.
+
+    No free nats are subtracted. The loss is exactly 0 where both logits are equal, as with a
+    zero-initialised critic.
+
+    Args:
+      value_logits: `[..., bins]` critic logits at s_t.
+      prior_value_logits: `[..., bins]` logits of the same critic at s~_t.
+      dynamics_scale: weight of the term that moves the prediction.
+      representation_scale: weight of the term that moves the inference.
+
+    Returns:
+      `[...]` losses in nats. Gradients reach both logits: the caller stops the critic's
+      parameters, or the critic learns to be indifferent instead.
+    """
+    stop = jax.lax.stop_gradient
+    dynamics = categorical_kl(stop(value_logits), prior_value_logits)
+    representation = categorical_kl(value_logits, stop(prior_value_logits))
+    return dynamics_scale * dynamics + representation_scale * representation
+
+
+def value_alignment_weight(latent_kl: Array, step: Array, *, warmup_steps: int) -> Array:
+    """Weight of the loss at each state, Eq. 5: small where the prediction is poor.
+
+        beta_t = [step > warmup_steps] / max(1, sg KL_t)
+
+    Args:
+      latent_kl: `[...]` KL[q || p] in nats, summed over the categoricals of z_t; raw, without
+        free nats. Its gradient is stopped.
+      step: `[]` steps so far, in the unit of `warmup_steps`.
+      warmup_steps: the weight is 0 up to and including this step.
+
+    Returns:
+      `[...]` weights in [0, 1].
+    """
+    chex.assert_rank(step, 0)
+    active = jnp.asarray(step > warmup_steps, jnp.float32)
+    return active / jnp.maximum(1.0, jax.lax.stop_gradient(latent_kl))

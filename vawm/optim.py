@@ -1,0 +1,73 @@
+"""LaProp after per-tensor adaptive gradient clipping: one optimiser for all parameters."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from vawm.config import OptimizerConfig
+
+
+def adaptive_gradient_clip(clip: float, floor: float) -> optax.GradientTransformation:
+    """Scale each gradient tensor down to at most `clip * max(floor, ||parameter||)`.
+
+    Norms are over whole tensors, as in DreamerV3; `optax.adaptive_grad_clip` takes one per
+    output unit. `floor` lets tensors that start at zero move at all.
+    """
+
+    def init(params: Any) -> optax.EmptyState:
+        del params
+        return optax.EmptyState()
+
+    def update(updates: Any, state: optax.EmptyState, params: Any = None):
+        if params is None:
+            raise ValueError(optax.NO_PARAMS_MSG)
+
+        def shrink(gradient, param):
+            limit = clip * jnp.maximum(floor, _norm(param))
+            return gradient / jnp.maximum(1.0, _norm(gradient) / limit)
+
+        return jax.tree.map(shrink, updates, params), state
+
+    return optax.GradientTransformation(init, update)
+
+
+def laprop(
+    learning_rate: optax.ScalarOrSchedule, beta1: float, beta2: float, eps: float
+) -> optax.GradientTransformation:
+    """LaProp: momentum of normalised gradients (Adam normalises the momentum instead).
+
+        v <- beta2 * v + (1 - beta2) * g^2
+        m <- beta1 * m + (1 - beta1) * g / (sqrt(v / (1 - beta2^t)) + eps)
+        update = -learning_rate * m / (1 - beta1^t)
+
+    A parameter whose gradient has always been 0 does not move. A schedule is read at 0 for
+    the first update.
+    """
+    return optax.chain(
+        optax.scale_by_rms(beta2, eps=eps, eps_in_sqrt=False, bias_correction=True),
+        optax.ema(beta1, debias=True),
+        optax.scale_by_learning_rate(learning_rate),
+    )
+
+
+def make_optimizer(config: OptimizerConfig) -> optax.GradientTransformation:
+    """Clipping, then LaProp with the learning rate rising from 0 over the warm-up.
+
+    The very first update has learning rate 0; update number `warmup_updates`, counted from
+    0, is the first at the full rate.
+    """
+    rate: optax.ScalarOrSchedule = config.learning_rate
+    if config.warmup_updates > 0:
+        rate = optax.linear_schedule(0.0, config.learning_rate, config.warmup_updates)
+    return optax.chain(
+        adaptive_gradient_clip(config.agc, config.agc_floor),
+        laprop(rate, config.beta1, config.beta2, config.epsilon),
+    )
+
+
+def _norm(x: jax.Array) -> jax.Array:
+    return jnp.sqrt(jnp.sum(jnp.square(x)))

@@ -1,0 +1,55 @@
+"""A trained agent, ready to act: what `vawm.load` returns."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+
+from vawm import checkpoint
+from vawm.agent import PolicyCarry, make_agent
+from vawm.config import Config
+from vawm.types import Array, EnvSpec, Key, Params, TimeStep
+
+
+class Policy(NamedTuple):
+    """The newest checkpoint of a run, without what only training needs.
+
+    Attributes:
+      config: of the run.
+      spec: of the environment it was trained in.
+      env_steps: when the checkpoint was written.
+      params: the parameters.
+      initial: `(batch_size) -> carry`, before the first observation.
+      act: `(key, carry, timestep) -> (carry, action [N, A])`, jitted; the action is raw.
+    """
+
+    config: Config
+    spec: EnvSpec
+    env_steps: int
+    params: Params
+    initial: Callable[[int], PolicyCarry]
+    act: Callable[[Key, PolicyCarry, TimeStep], tuple[PolicyCarry, Array]]
+
+
+def load(logdir: str | os.PathLike[str]) -> Policy:
+    """The policy in `logdir`; only its parameters are read.
+
+    Raises:
+      InvalidInput: there is no checkpoint, or it is damaged.
+    """
+    _, manifest = checkpoint.read_manifest(logdir)
+    agent = make_agent(manifest.config, manifest.spec)
+    target = jax.eval_shape(agent.init, jax.random.key(0))
+    params, manifest = checkpoint.restore_params(logdir, target)
+    act = jax.jit(agent.act)
+    return Policy(
+        config=manifest.config,
+        spec=manifest.spec,
+        env_steps=manifest.env_steps,
+        params=params,
+        initial=agent.initial,
+        act=lambda key, carry, timestep: act(params, key, carry, timestep),
+    )

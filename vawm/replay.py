@@ -1,0 +1,126 @@
+"""A ring buffer of experience that lives on the device.
+
+Every leaf is `[N, C, ...]`: N streams, one per environment, of C steps each. A sample is
+a run of consecutive steps of one stream, free to cross episode ends, never the write
+head. Beside each step lies the latent that the agent inferred there; a sample starts from
+the one at its first step, and the learner writes the latents that it infers back.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from vawm.config import Config
+from vawm.types import Array, Key, Latent, Trajectory
+
+
+class Replay(NamedTuple):
+    trajectory: Trajectory  # [N, C, ...]
+    latent: Latent  # deter [N, C, D]; stoch as class indices [N, C, S] uint8
+    head: Array  # [] int32, where the next step is written
+    size: Array  # [] int32, steps held in each stream
+
+
+class Positions(NamedTuple):
+    """Where a sample lies."""
+
+    env: Array  # [B]
+    time: Array  # [B, L]
+
+
+def capacity_per_env(config: Config) -> int:
+    """Steps kept of each environment: never more than the run collects.
+
+    A run of `env_steps` control steps makes at most twice as many calls as it has
+    decisions (a reset follows each episode), and collects in whole chunks.
+    """
+    calls = -(-config.env_steps // (config.num_envs * config.action_repeat))
+    resets = -(-calls // 100) + 1  # generous: full episodes have 1000 / action_repeat calls
+    collected = -(-(calls + resets) // config.collect_steps) * config.collect_steps
+    return max(1, min(config.replay.capacity // config.num_envs, collected))
+
+
+def init(example: Trajectory, latent: Latent, *, capacity: int) -> Replay:
+    """An empty buffer for steps like `example` and `latent`, each `[N, ...]`."""
+
+    def empty(x):
+        return jnp.zeros((x.shape[0], capacity, *x.shape[1:]), x.dtype)
+
+    return Replay(
+        trajectory=jax.tree.map(empty, example),
+        latent=jax.tree.map(empty, pack(latent)),
+        head=jnp.zeros((), jnp.int32),
+        size=jnp.zeros((), jnp.int32),
+    )
+
+
+def pack(latent: Latent) -> Latent:
+    """One-hot classes as their indices: exact, and a byte instead of K floats."""
+    return latent._replace(stoch=jnp.argmax(latent.stoch, -1).astype(jnp.uint8))
+
+
+def unpack(latent: Latent, classes: int) -> Latent:
+    """Inverse of `pack`."""
+    return latent._replace(stoch=jax.nn.one_hot(latent.stoch, classes, dtype=latent.deter.dtype))
+
+
+def add(replay: Replay, trajectory: Trajectory, latent: Latent) -> Replay:
+    """Append K steps `[N, K, ...]` to every stream; the oldest are overwritten."""
+    capacity = replay.trajectory.reward.shape[1]
+    length = trajectory.reward.shape[1]
+    if length > capacity:
+        raise ValueError(f"cannot add {length} steps to a buffer of {capacity}")
+    time = (replay.head + jnp.arange(length)) % capacity
+
+    def write(buffer, x):
+        return buffer.at[:, time].set(x.astype(buffer.dtype))
+
+    return Replay(
+        trajectory=jax.tree.map(write, replay.trajectory, trajectory),
+        latent=jax.tree.map(write, replay.latent, pack(latent)),
+        head=(replay.head + length) % capacity,
+        size=jnp.minimum(replay.size + length, capacity),
+    )
+
+
+def num_starts(replay: Replay, length: int) -> Array:
+    """In how many places, over all streams, a sample of `length` steps can begin."""
+    num_envs = replay.trajectory.reward.shape[0]
+    return num_envs * jnp.maximum(replay.size - length + 1, 0)
+
+
+def sample(
+    replay: Replay, key: Key, *, batch_size: int, length: int, classes: int
+) -> tuple[Trajectory, Latent, Positions]:
+    """Draw `batch_size` runs of `length` steps, uniformly over all possible starts.
+
+    Needs `num_starts(replay, length) > 0`.
+
+    Returns:
+      The trajectories `[B, L, ...]`, the stored latents of their first steps `[B, ...]`,
+      and where they lie, for `write_back`.
+    """
+    num_envs, capacity = replay.trajectory.reward.shape
+    key_env, key_start = jax.random.split(key)
+    env = jax.random.randint(key_env, (batch_size,), 0, num_envs)
+    start = jax.random.randint(key_start, (batch_size,), 0, replay.size - length + 1)
+    oldest = replay.head - replay.size
+    time = (oldest + start[:, None] + jnp.arange(length)[None, :]) % capacity
+    trajectory = jax.tree.map(lambda x: x[env[:, None], time], replay.trajectory)
+    context = jax.tree.map(lambda x: x[env, time[:, 0]], replay.latent)
+    # An episode that a reset cut short has no last step of its own.
+    abandoned = jnp.pad(trajectory.is_first[:, 1:], ((0, 0), (0, 1)))
+    trajectory = trajectory._replace(is_last=trajectory.is_last | abandoned)
+    return trajectory, unpack(context, classes), Positions(env, time)
+
+
+def write_back(replay: Replay, positions: Positions, latent: Latent) -> Replay:
+    """Replace the stored latents at `positions` by newer ones, `[B, L, ...]`."""
+
+    def write(buffer, x):
+        return buffer.at[positions.env[:, None], positions.time].set(x.astype(buffer.dtype))
+
+    return replay._replace(latent=jax.tree.map(write, replay.latent, pack(latent)))

@@ -1,0 +1,77 @@
+"""Continuing a run: the same choices, the same state, perhaps more steps."""
+
+from __future__ import annotations
+
+import os
+
+import jax
+import jax.numpy as jnp
+
+from vawm import checkpoint, validate
+from vawm.config import Config
+from vawm.errors import InvalidInput
+from vawm.manifest import Manifest
+from vawm.replay import Replay
+from vawm.types import PyTree
+
+MAY_DIFFER = ("env_steps", "log_every", "save_every")
+
+
+def check(logdir: str | os.PathLike[str], config: Config) -> Manifest:
+    """Whether the newest checkpoint in `logdir` can be continued as `config`.
+
+    Raises:
+      InvalidInput: there is none, a choice differs, or there is nothing left to do.
+    """
+    _, manifest = checkpoint.read_manifest(logdir)
+    saved = dict(validate.values(manifest.config))
+    for name, value in validate.values(config):
+        if name not in MAY_DIFFER and value != saved[name]:
+            remedy = f"the checkpoint was trained with {saved[name]!r}; use that to resume"
+            raise InvalidInput(name, value, remedy)
+    if config.env_steps <= manifest.env_steps:
+        remedy = f"the checkpoint is at {manifest.env_steps} already; use more to continue it"
+        raise InvalidInput("env_steps", config.env_steps, remedy)
+    return manifest
+
+
+def restore(logdir: str | os.PathLike[str], shapes: PyTree) -> tuple[PyTree, Manifest]:
+    """The saved `TrainState`; `shapes` is what the run would start with otherwise.
+
+    A run that is extended may want a larger replay than was saved: it is grown.
+    """
+    _, manifest = checkpoint.read_manifest(logdir)
+    saved = manifest.leaves["state"].get(".replay.trajectory.reward")
+    wanted = shapes.replay.trajectory.reward.shape[1]
+    capacity = saved.shape[1] if saved else wanted
+    target = shapes._replace(replay=_with_capacity(shapes.replay, capacity))
+    state, manifest = checkpoint.restore(logdir, target)
+    if wanted > capacity:
+        state = state._replace(replay=grow(state.replay, wanted))
+    return state, manifest
+
+
+def _with_capacity(replay: Replay, capacity: int) -> Replay:
+    def reshape(x: jax.ShapeDtypeStruct) -> jax.ShapeDtypeStruct:
+        if x.ndim < 2:
+            return x
+        return jax.ShapeDtypeStruct((x.shape[0], capacity, *x.shape[2:]), x.dtype)
+
+    return jax.tree.map(reshape, replay)
+
+
+def grow(replay: Replay, capacity: int) -> Replay:
+    """The same steps in a larger buffer, the oldest first."""
+    old = replay.trajectory.reward.shape[1]
+    oldest = (int(replay.head) - int(replay.size)) % old
+
+    def pad(x: jax.Array) -> jax.Array:
+        widths = [(0, 0), (0, capacity - old)] + [(0, 0)] * (x.ndim - 2)
+        return jnp.pad(jnp.roll(x, -oldest, axis=1), widths)
+
+    return Replay(
+        trajectory=jax.tree.map(pad, replay.trajectory),
+        latent=jax.tree.map(pad, replay.latent),
+        head=replay.size % capacity,
+        size=replay.size,
+    )

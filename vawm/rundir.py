@@ -1,0 +1,89 @@
+"""The folder of one run: who may use it, and what it says it holds."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import os
+import pathlib
+import socket
+from collections.abc import Iterator
+
+from vawm import config as config_lib
+from vawm import manifest as manifest_lib
+from vawm.config import Config
+from vawm.errors import InvalidInput
+
+LOCK = "lock"
+
+
+def check_new(logdir: pathlib.Path) -> None:
+    """Refuses a folder that cannot be made, written to, or holds something already.
+
+    Raises:
+      InvalidInput: nothing was written.
+    """
+    check_writable(logdir)
+    if logdir.is_dir() and any(logdir.iterdir()):
+        remedy = "exists; continue that run with --resume or choose another --logdir"
+        raise InvalidInput("logdir", str(logdir), remedy)
+
+
+def check_writable(logdir: pathlib.Path) -> None:
+    """Refuses a path at which no folder can be written.
+
+    Raises:
+      InvalidInput: nothing was written.
+    """
+    try:
+        nearest = logdir.absolute()
+        while not nearest.exists():
+            nearest = nearest.parent
+        usable = nearest.is_dir() and os.access(nearest, os.W_OK | os.X_OK)
+    except OSError:
+        usable = False
+    if not usable:
+        remedy = "is not writable; choose another --logdir"
+        raise InvalidInput("logdir", str(logdir), remedy)
+
+
+@contextlib.contextmanager
+def claim(logdir: pathlib.Path) -> Iterator[None]:
+    """Makes the folder and holds it for this process alone.
+
+    The kernel gives the lock back when a process ends, however it ends.
+
+    Raises:
+      InvalidInput: another process holds it, or the folder cannot be made.
+    """
+    try:
+        logdir.mkdir(parents=True, exist_ok=True)
+        file = (logdir / LOCK).open("a+")
+    except OSError as error:
+        remedy = f"is not writable ({error.strerror}); choose another --logdir"
+        raise InvalidInput("logdir", str(logdir), remedy) from error
+    with file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            file.seek(0)
+            holder = file.read().strip() or "another process"
+            remedy = f"is in use by {holder}; wait for it or choose another --logdir"
+            raise InvalidInput("logdir", str(logdir), remedy) from error
+        file.truncate(0)
+        file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
+        file.flush()
+        yield
+
+
+def write_config(logdir: pathlib.Path, config: Config) -> None:
+    """Writes `config.json`: all choices of the run and what wrote them."""
+    content = {
+        "schema": manifest_lib.SCHEMA,
+        "vawm": manifest_lib.version(),
+        "config": config_lib.as_dict(config),
+    }
+    scratch = logdir / "config.json.tmp"
+    scratch.write_text(json.dumps(content, indent=2) + "\n")
+    scratch.replace(logdir / "config.json")

@@ -1,0 +1,64 @@
+"""Ctrl-C and SIGTERM: the first asks a run to stop in order, the second ends it."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class Stop:
+    """`signal` is the number of the signal that asked for the end, or None."""
+
+    signal: int | None = None
+
+    @property
+    def exit_code(self) -> int:
+        """What a shell expects of a process that a signal ended; 0 without one."""
+        return 0 if self.signal is None else 128 + self.signal
+
+
+@contextlib.contextmanager
+def catch(notify: Callable[[], None] = lambda: None) -> Iterator[Stop]:
+    """Turns the first signal into a request, and lets the second end the process at once.
+
+    A thread hears of signals through a pipe, because Python runs its own handlers only
+    between two calls of compiled code, which can be minutes apart. Outside the main
+    thread signals cannot be caught, and nothing is.
+
+    Args:
+      notify: called at the first signal, in that thread.
+    """
+    stop = Stop()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+
+    def listen() -> None:
+        while received := os.read(reader, 1):
+            if received[0] not in SIGNALS:
+                continue
+            if stop.signal is not None:
+                os._exit(128 + received[0])
+            stop.signal = received[0]
+            notify()
+
+    thread = threading.Thread(target=listen, daemon=True)
+    previous = {number: signal.signal(number, lambda *_: None) for number in SIGNALS}
+    previous_fd = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+    thread.start()
+    try:
+        yield stop
+    finally:
+        signal.set_wakeup_fd(previous_fd)
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+        os.close(writer)
+        thread.join()
+        os.close(reader)

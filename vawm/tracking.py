@@ -1,0 +1,147 @@
+"""What a run reports: means over an interval, lines of JSON, TensorBoard events.
+
+`metrics.jsonl` is the source of truth: one strictly valid JSON object per line, written
+when the interval between two lines is complete. Means weigh every chunk by its number of
+updates; counts are sums. An `Interval` is plain numbers, so a checkpoint can carry it.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import pathlib
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import tensorboardX
+
+Line = dict[str, Any]
+
+COUNTERS = ("env_steps", "updates")
+EPISODE_SUMS = ("episode/return", "episode/length")
+
+
+class Interval(NamedTuple):
+    """What was measured since the last line.
+
+    Attributes:
+      updates: updates in the interval.
+      weighted: name -> sum over updates, for metrics that are means.
+      counted: name -> sum over chunks, for metrics that are counts.
+      env_steps: env steps in the interval.
+      seconds: wall time of the interval.
+    """
+
+    updates: int = 0
+    weighted: dict[str, float] = {}  # noqa: RUF012 - never mutated
+    counted: dict[str, float] = {}  # noqa: RUF012
+    env_steps: int = 0
+    seconds: float = 0.0
+
+
+def is_count(name: str) -> bool:
+    """Whether chunks add this metric up instead of averaging it."""
+    return name.startswith(("episode/", "env/"))
+
+
+def add(
+    interval: Interval, metrics: Mapping[str, Any], *, env_steps: int, seconds: float
+) -> Interval:
+    """`interval` with one chunk more; `env_steps` and `seconds` are the chunk's own."""
+    updates = int(metrics["chunk/updates"])
+    weighted, counted = dict(interval.weighted), dict(interval.counted)
+    for name, value in metrics.items():
+        if name in COUNTERS or name.startswith("chunk/"):
+            continue
+        if is_count(name):
+            counted[name] = counted.get(name, 0.0) + float(value)
+        else:  # NaN when the chunk had no updates, so not even added
+            chunk = updates * float(value) if updates else 0.0
+            weighted[name] = weighted.get(name, 0.0) + chunk
+    return Interval(
+        updates=interval.updates + updates,
+        weighted=weighted,
+        counted=counted,
+        env_steps=interval.env_steps + env_steps,
+        seconds=interval.seconds + seconds,
+    )
+
+
+def line(interval: Interval, *, env_steps: int, updates: int, seconds: float) -> Line:
+    """The line that closes `interval`; the keyword numbers are the run's totals.
+
+    Episode metrics are means over the episodes that finished, None where none did; the
+    other means are None where nothing was updated.
+    """
+    episodes = interval.counted.get("episode/count", 0.0)
+    result: Line = {"env_steps": env_steps, "updates": updates}
+    for name, total in sorted(interval.counted.items()):
+        if name in EPISODE_SUMS:
+            result[name] = total / episodes if episodes else None
+        else:
+            result[name] = int(total)
+    for name, total in sorted(interval.weighted.items()):
+        result[name] = total / interval.updates if interval.updates else None
+    result["time"] = round(seconds, 3)
+    for name, amount in [("env_steps", interval.env_steps), ("updates", interval.updates)]:
+        speed = amount / interval.seconds if interval.seconds else 0.0
+        result[f"{name}_per_s"] = round(speed, 3)
+    return result
+
+
+def as_json(value: Line) -> str:
+    """One line of strictly valid JSON: what is not finite becomes null."""
+    return json.dumps({k: _finite_or_none(v) for k, v in value.items()}, allow_nan=False)
+
+
+def _finite_or_none(value: Any) -> Any:
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def read(path: str | os.PathLike[str]) -> list[Line]:
+    """All complete lines of a `metrics.jsonl`; a half-written last one is left out."""
+    lines = []
+    for text in pathlib.Path(path).read_text().splitlines():
+        try:
+            lines.append(json.loads(text))
+        except json.JSONDecodeError:
+            break
+    return lines
+
+
+def truncate(path: str | os.PathLike[str], env_steps: int) -> None:
+    """Drops the lines later than `env_steps`, and a half-written one."""
+    path = pathlib.Path(path)
+    if not path.exists():
+        return
+    kept = [entry for entry in read(path) if entry["env_steps"] <= env_steps]
+    text = "".join(as_json(entry) + "\n" for entry in kept)
+    scratch = path.with_suffix(".jsonl.tmp")
+    scratch.write_text(text)
+    scratch.replace(path)
+
+
+class Tracker:
+    """Writes lines to `metrics.jsonl` and TensorBoard; a context manager."""
+
+    def __init__(self, logdir: pathlib.Path, *, purge_after: int | None = None):
+        self._file = (logdir / "metrics.jsonl").open("a")
+        purge = None if purge_after is None else purge_after + 1
+        self._board = tensorboardX.SummaryWriter(str(logdir), purge_step=purge)
+
+    def write(self, entry: Line) -> None:
+        """Appends one line; it is in the file when this returns."""
+        self._file.write(as_json(entry) + "\n")
+        self._file.flush()
+        for name, value in entry.items():
+            if _finite_or_none(value) is not None:
+                self._board.add_scalar(name, value, entry["env_steps"])
+        self._board.flush()
+
+    def __enter__(self) -> Tracker:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+        self._board.close()

@@ -1,0 +1,150 @@
+"""Symlog, the two-hot code over symexp-spaced bins, and categorical arithmetic.
+
+The bins reach +-4.85e8 and are exactly symmetric, so sums over them are arranged to cancel
+exactly where they should. Everything here computes in float32, whatever the logits are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+Array = jax.Array
+
+
+def symlog(x: Array) -> Array:
+    """sign(x) * log(1 + |x|): compresses magnitude, keeps sign and the slope at 0."""
+    return jnp.sign(x) * jnp.log1p(jnp.abs(x))
+
+
+def symexp(x: Array) -> Array:
+    """sign(x) * (exp(|x|) - 1), the inverse of `symlog`."""
+    return jnp.sign(x) * jnp.expm1(jnp.abs(x))
+
+
+def symexp_bins(n: int) -> Array:
+    """`[n]` increasing values from -symexp(20) to symexp(20), evenly spaced in symlog.
+
+    The upper half is the negated lower half, bit for bit. Odd `n` has 0 in the middle; even
+    `n` has it twice, as in the official DreamerV3.
+    """
+    if n < 2:
+        raise ValueError(f"symexp_bins needs at least 2 bins, got n={n}")
+    lower = -np.expm1(-np.linspace(-20.0, 0.0, (n + 1) // 2, dtype=np.float64))
+    upper = -lower[::-1]
+    bins = np.concatenate([lower, upper[n % 2 :]]).astype(np.float32)
+    return jnp.asarray(bins + 0.0)  # -0.0 becomes 0.0
+
+
+def two_hot(y: Array, bins: Array) -> Array:
+    """`[..., n]` distribution on the two bins around `y` whose mean is `y`.
+
+    Weights are linear in raw distance; `y` beyond the ends goes onto the end bin. Losses do
+    not build this array: see `two_hot_cross_entropy`.
+    """
+    below, above, weight_below, weight_above = _neighbours(y, bins)
+    n = bins.shape[0]
+    return (
+        jax.nn.one_hot(below, n) * weight_below[..., None]
+        + jax.nn.one_hot(above, n) * weight_above[..., None]
+    )
+
+
+def two_hot_mean(logits: Array, bins: Array) -> Array:
+    """Mean of softmax(logits) over `bins`, in raw space: sum_i p_i * bins_i.
+
+    Mirrored bins are paired before anything is added, (p_{n-1-i} - p_i) * bins_{n-1-i}, so
+    that symmetric logits, such as those of a zero-initialised head, give exactly 0.
+
+    Args:
+      logits: `[..., n]`.
+      bins: `[n]` from `symexp_bins`, exactly symmetric.
+
+    Returns:
+      `[...]` means in the units of `bins`.
+    """
+    chex.assert_equal(logits.shape[-1:], bins.shape)
+    half = bins.shape[0] // 2
+    logits = logits.astype(jnp.float32)
+    exp = jnp.exp(logits - jax.lax.stop_gradient(logits.max(-1, keepdims=True)))
+    odd = exp[..., -half:] - exp[..., :half][..., ::-1]
+    upper = jnp.expand_dims(bins[-half:], tuple(range(logits.ndim - 1)))
+    return (odd * upper).sum(-1) / exp.sum(-1)
+
+
+def two_hot_cross_entropy(logits: Array, target: Array, bins: Array) -> Array:
+    """`[...]` cross-entropy of softmax(logits) to the two-hot code of `target`.
+
+    See `two_hot_cross_entropies`, of which this is the case of a single target.
+    """
+    (loss,) = two_hot_cross_entropies(logits, (target,), bins)
+    return loss
+
+
+def two_hot_cross_entropies(
+    logits: Array, targets: Sequence[Array], bins: Array
+) -> tuple[Array, ...]:
+    """Cross-entropies of one set of logits to several two-hot targets.
+
+        CE_k = logsumexp(logits) - w_below * logits[below_k] - w_above * logits[above_k]
+
+    The two logits are read by index and the log-sum-exp is shared, so no dense target and no
+    log-softmax is ever built.
+
+    Args:
+      logits: `[..., n]`.
+      targets: each `[...]`, in the units of `bins`; beyond the ends they are clipped.
+      bins: `[n]` increasing.
+
+    Returns:
+      One `[...]` loss per target. Gradients reach the logits only; targets are stopped.
+    """
+    chex.assert_equal(logits.shape[-1:], bins.shape)
+    logits = logits.astype(jnp.float32)
+    normalizer = jax.nn.logsumexp(logits, axis=-1)
+    chex.assert_equal_shape([normalizer, *targets])
+
+    def score(target):
+        target = jax.lax.stop_gradient(target)
+        below, above, weight_below, weight_above = _neighbours(target, bins)
+        return weight_below * _pick(logits, below) + weight_above * _pick(logits, above)
+
+    return tuple(normalizer - score(target) for target in targets)
+
+
+def unimix_logits(logits: Array, unimix: float) -> Array:
+    """log((1 - u) * softmax(logits) + u / K): normalised, and no class below u / K."""
+    log_prob = jax.nn.log_softmax(logits.astype(jnp.float32))
+    if unimix == 0:
+        return log_prob
+    return jnp.log((1 - unimix) * jnp.exp(log_prob) + unimix / logits.shape[-1])
+
+
+def categorical_kl(p_logits: Array, q_logits: Array) -> Array:
+    """KL[softmax(p) || softmax(q)] over the last axis; exactly 0 for equal logits."""
+    chex.assert_equal_shape([p_logits, q_logits])
+    log_p = jax.nn.log_softmax(p_logits.astype(jnp.float32))
+    log_q = jax.nn.log_softmax(q_logits.astype(jnp.float32))
+    return (jnp.exp(log_p) * (log_p - log_q)).sum(-1)
+
+
+def _neighbours(y: Array, bins: Array) -> tuple[Array, Array, Array, Array]:
+    """Indices and weights of the bins below and above `y`, each of `y`'s shape."""
+    y = y.astype(jnp.float32)
+    after = jnp.searchsorted(bins, y, side="right")
+    last = bins.shape[0] - 1
+    below, above = jnp.clip(after - 1, 0, last), jnp.clip(after, 0, last)
+    # Beyond the ends both are the end bin, which takes half the weight twice.
+    same = below == above
+    from_below = jnp.where(same, 1.0, jnp.abs(y - bins[below]))
+    from_above = jnp.where(same, 1.0, jnp.abs(bins[above] - y))
+    total = from_below + from_above
+    return below, above, from_above / total, from_below / total
+
+
+def _pick(x: Array, index: Array) -> Array:
+    return jnp.take_along_axis(x, index[..., None], axis=-1, mode="clip")[..., 0]

@@ -1,0 +1,130 @@
+"""The recurrent state-space model of DreamerV3 as a `WorldModel`."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+
+from vawm import distributions, nets
+from vawm.config import WorldModelConfig
+from vawm.types import Array, EnvSpec, Inference, Key, Latent, PyTree, Trajectory
+from vawm.world_model.heads import flat_stoch, vector_heads
+from vawm.world_model.protocol import WorldModel
+
+
+def rssm(
+    config: WorldModelConfig,
+    spec: EnvSpec,
+    *,
+    dtype: jnp.dtype = jnp.float32,
+    noise: Literal["independent", "shared"] = "independent",
+) -> WorldModel:
+    """DreamerV3's world model with block GRU.
+
+        h_t = f(h_{t-1}, z_{t-1}, a_{t-1}),  z_t ~ q(z | h_t, o_t),  z~_t ~ p(z | h_t)
+
+    The carry of `observe` is the `Latent` s_{t-1}. What needs no recurrence (the
+    encoder, what the action and the observation add to their layers, the prior) is
+    computed for all time steps at once; the scan holds only the rest.
+
+    Args:
+      config: widths and layers.
+      spec: shapes of observation and action.
+      dtype: of products; parameters, logits and norms stay float32.
+      noise: whether z~ is sampled with its own noise or with the noise of z ("shared":
+        equal distributions then give equal samples).
+    """
+    heads = vector_heads(config, spec, dtype)
+    net = nets.RSSM(
+        deter=config.deter,
+        hidden=config.hidden,
+        stoch=config.stoch,
+        classes=config.classes,
+        action=spec.action_size,
+        tokens=heads.token_size,
+        blocks=config.blocks,
+        prior_layers=config.prior_layers,
+        dtype=dtype,
+    )
+    stoch_shape = config.stoch, config.classes
+
+    def apply(params: PyTree, method, *args):
+        return net.apply({"params": params["rssm"]}, *args, method=method)
+
+    def sample(logits: Array, uniform: Array) -> Array:
+        return distributions.sample_one_hot(logits, uniform, unimix=config.unimix).astype(dtype)
+
+    def init(key: Key) -> PyTree:
+        key_rssm, key_heads = jax.random.split(key)
+        widths = config.deter, config.stoch * config.classes, spec.action_size, heads.token_size
+        params = net.init(key_rssm, *(jnp.zeros((1, width), dtype) for width in widths))
+        return {"rssm": params["params"], **heads.init(key_heads)}
+
+    def initial(batch_size: int) -> Latent:
+        return Latent(
+            jnp.zeros((batch_size, config.deter), dtype),
+            jnp.zeros((batch_size, *stoch_shape), dtype),
+        )
+
+    def observe(
+        params: PyTree,
+        key: Key,
+        carry: Latent,
+        obs: Array,
+        prev_action: Array,
+        is_first: Array,
+        *,
+        train: bool,
+    ) -> tuple[Latent, Inference]:
+        del train  # nothing in this model differs between training and acting
+        key_post, key_prior = jax.random.split(key)
+        batch, length = is_first.shape
+        obs, prev_action, is_first = (x.swapaxes(0, 1) for x in (obs, prev_action, is_first))
+        keep = 1.0 - is_first.astype(dtype)[..., None]
+        drive = apply(params, lambda m, a: m.gru.drive(a), prev_action.astype(dtype) * keep)
+        tokens = apply(params, nets.RSSM.read_tokens, heads.encode(params, obs))
+        uniform = jax.random.uniform(key_post, (length, batch, config.stoch))
+
+        def step(latent: Latent, inputs):
+            keep, drive, tokens, uniform = inputs
+            deter, stoch = latent.deter * keep, flat_stoch(latent) * keep
+            deter = apply(params, nets.RSSM.advance, deter, stoch, drive)
+            logits = apply(params, nets.RSSM.posterior, deter, tokens)
+            latent = Latent(deter, sample(logits, uniform))
+            return latent, (latent, logits)
+
+        carry, (latent, post_logits) = jax.lax.scan(step, carry, (keep, drive, tokens, uniform))
+        prior_logits = apply(params, nets.RSSM.prior, latent.deter)
+        if noise == "independent":
+            uniform = jax.random.uniform(key_prior, uniform.shape)
+        prior_latent = Latent(latent.deter, sample(prior_logits, uniform))
+        inference = Inference(
+            latent, prior_latent, post_logits, prior_logits, jnp.ones_like(is_first)
+        )
+        return carry, jax.tree.map(lambda x: x.swapaxes(0, 1), inference)
+
+    def starts(
+        params: PyTree, key: Key, trajectory: Trajectory, inference: Inference
+    ) -> tuple[tuple[Array, Latent], Latent]:
+        """Every posterior state of the batch, terminal ones included: N = B * T."""
+        del key, trajectory
+        flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), inference.latent)
+        latent = jax.lax.stop_gradient(flat)
+        blocks = apply(params, lambda m, h: m.gru.to_blocks(h), latent.deter)
+        return (blocks, latent), latent
+
+    def imagine(
+        params: PyTree, key: Key, carry: tuple[Array, Latent], action: Array
+    ) -> tuple[tuple[Array, Latent], Latent]:
+        blocks, latent = carry
+        drive = apply(params, lambda m, a: m.gru.drive(a), action.astype(dtype))
+        blocks, deter, logits = apply(
+            params, nets.RSSM.imagine, blocks, latent.deter, flat_stoch(latent), drive
+        )
+        uniform = jax.random.uniform(key, logits.shape[:-1])
+        latent = Latent(deter, sample(logits, uniform))
+        return (blocks, latent), latent
+
+    return WorldModel(init, initial, observe, starts, imagine, heads.predict)
