@@ -24,7 +24,9 @@ def adaptive_gradient_clip(clip: float, floor: float) -> optax.GradientTransform
 
     def update(updates: Any, state: optax.EmptyState, params: Any = None):
         if params is None:
-            raise ValueError(optax.NO_PARAMS_MSG)
+            raise ValueError(
+                "adaptive_gradient_clip needs params: update(updates, state, params)"
+            )
 
         def shrink(gradient, param):
             limit = clip * jnp.maximum(floor, _norm(param))

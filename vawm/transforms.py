@@ -46,12 +46,9 @@ def two_hot(y: Array, bins: Array) -> Array:
     Weights are linear in raw distance; `y` beyond the ends goes onto the end bin. Losses do
     not build this array: see `two_hot_cross_entropy`.
     """
-    below, above, weight_below, weight_above = _neighbours(y, bins)
-    n = bins.shape[0]
-    return (
-        jax.nn.one_hot(below, n) * weight_below[..., None]
-        + jax.nn.one_hot(above, n) * weight_above[..., None]
-    )
+    below, above, share = _neighbours(y, bins)
+    n, share = bins.shape[0], share[..., None]
+    return (1 - share) * jax.nn.one_hot(below, n) + share * jax.nn.one_hot(above, n)
 
 
 def two_hot_mean(logits: Array, bins: Array) -> Array:
@@ -90,7 +87,7 @@ def two_hot_cross_entropies(
 ) -> tuple[Array, ...]:
     """Cross-entropies of one set of logits to several two-hot targets.
 
-        CE_k = logsumexp(logits) - w_below * logits[below_k] - w_above * logits[above_k]
+        CE_k = logsumexp(logits) - (1 - w_k) * logits[below_k] - w_k * logits[above_k]
 
     The two logits are read by index and the log-sum-exp is shared, so no dense target and no
     log-softmax is ever built.
@@ -109,9 +106,8 @@ def two_hot_cross_entropies(
     chex.assert_equal_shape([normalizer, *targets])
 
     def score(target):
-        target = jax.lax.stop_gradient(target)
-        below, above, weight_below, weight_above = _neighbours(target, bins)
-        return weight_below * _pick(logits, below) + weight_above * _pick(logits, above)
+        below, above, share = _neighbours(jax.lax.stop_gradient(target), bins)
+        return (1 - share) * _pick(logits, below) + share * _pick(logits, above)
 
     return tuple(normalizer - score(target) for target in targets)
 
@@ -132,18 +128,16 @@ def categorical_kl(p_logits: Array, q_logits: Array) -> Array:
     return (jnp.exp(log_p) * (log_p - log_q)).sum(-1)
 
 
-def _neighbours(y: Array, bins: Array) -> tuple[Array, Array, Array, Array]:
-    """Indices and weights of the bins below and above `y`, each of `y`'s shape."""
-    y = y.astype(jnp.float32)
+def _neighbours(y: Array, bins: Array) -> tuple[Array, Array, Array]:
+    """Indices of the bins below and above `y`, and the weight of the one above."""
+    # Clipping keeps NaN, which the weight then carries: a broken target is not hidden.
+    y = jnp.clip(y.astype(jnp.float32), bins[0], bins[-1])
     after = jnp.searchsorted(bins, y, side="right")
     last = bins.shape[0] - 1
     below, above = jnp.clip(after - 1, 0, last), jnp.clip(after, 0, last)
-    # Beyond the ends both are the end bin, which takes half the weight twice.
-    same = below == above
-    from_below = jnp.where(same, 1.0, jnp.abs(y - bins[below]))
-    from_above = jnp.where(same, 1.0, jnp.abs(bins[above] - y))
-    total = from_below + from_above
-    return below, above, from_above / total, from_below / total
+    # At the upper end both are the last bin: its weight is 1 whatever the share.
+    gap = jnp.where(below == above, 1.0, bins[above] - bins[below])
+    return below, above, (y - bins[below]) / gap
 
 
 def _pick(x: Array, index: Array) -> Array:

@@ -1,0 +1,188 @@
+"""Prediction and dynamics losses against float64 twins, and by hand."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from vawm import losses, transforms
+
+BINS = transforms.symexp_bins(41)
+KL = {"unimix": 0.01, "free_nats": 1.0, "dynamics_scale": 1.0, "representation_scale": 0.1}
+
+
+def slow_kl(post_logits, prior_logits, unimix):
+    """`[...]` KL of unimixed categoricals, summed over the last two axes."""
+
+    def probs(logits):
+        logits = np.asarray(logits, np.float64)
+        p = np.exp(logits - logits.max(-1, keepdims=True))
+        p /= p.sum(-1, keepdims=True)
+        return (1 - unimix) * p + unimix / p.shape[-1]
+
+    q, p = probs(post_logits), probs(prior_logits)
+    return (q * np.log(q / p)).sum((-2, -1))
+
+
+dynamics_loss = jax.jit(losses.dynamics_loss, static_argnames=tuple(KL))
+prediction_loss = jax.jit(losses.prediction_loss, static_argnames="discount")
+
+
+def logits(scale, shape=(2, 3, 4, 5)):
+    return scale * jax.random.normal(jax.random.key(0), (2, *shape))
+
+
+def gradients(post, prior, **numbers):
+    loss = lambda q, p: dynamics_loss(q, p, **numbers)[0].sum()  # noqa: E731
+    return jax.jit(jax.grad(loss, argnums=(0, 1)))(post, prior)
+
+
+@pytest.mark.parametrize("scale", [0.1, 3.0, 100.0])
+@pytest.mark.parametrize("unimix", [0.01, 0.5])
+def test_dynamics_loss_matches_its_twin(scale, unimix):
+    post, prior = logits(scale)
+    loss, kl = dynamics_loss(post, prior, **KL | {"unimix": unimix})
+    twin = slow_kl(post, prior, unimix)
+    np.testing.assert_allclose(kl, twin, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(loss, 1.1 * np.maximum(1, twin), rtol=1e-4)
+
+
+def test_free_nats_are_applied_after_the_sum_and_at_each_state():
+    # 32 categoricals of 0.1 nats each: 3.2 in total, although each alone is below 1.
+    post = jnp.tile(jnp.array([0.7375, 0.0]), (2, 32, 1))
+    post = post.at[1].set(0.0)
+    loss, kl = dynamics_loss(post, jnp.zeros_like(post), **KL | {"unimix": 0.0})
+    assert kl[0] > 1.0
+    assert kl[0] / 32 < 1.0
+    np.testing.assert_allclose(loss, [1.1 * kl[0], 1.1], rtol=1e-6)
+    assert kl[1] == 0
+
+
+def test_dynamics_term_moves_the_prior_alone():
+    post, prior = logits(3.0)
+    to_post, to_prior = gradients(post, prior, **KL | {"representation_scale": 0.0})
+    np.testing.assert_array_equal(to_post, np.zeros_like(post))
+    assert (np.abs(to_prior) > 0).any()
+
+
+def test_representation_term_moves_the_posterior_alone():
+    post, prior = logits(3.0)
+    to_post, to_prior = gradients(post, prior, **KL | {"dynamics_scale": 0.0})
+    np.testing.assert_array_equal(to_prior, np.zeros_like(prior))
+    assert (np.abs(to_post) > 0).any()
+
+
+def test_below_the_free_nats_there_is_no_gradient():
+    post, prior = logits(0.05)
+    for gradient in gradients(post, prior, **KL):
+        np.testing.assert_array_equal(gradient, np.zeros_like(post))
+
+
+def test_reported_kl_has_no_gradient():
+    post, prior = logits(3.0)
+    kl = lambda q, p: dynamics_loss(q, p, **KL)[1].sum()  # noqa: E731
+    for gradient in jax.jit(jax.grad(kl, argnums=(0, 1)))(post, prior):
+        np.testing.assert_array_equal(gradient, np.zeros_like(post))
+
+
+def test_dynamics_loss_is_finite_at_certainty():
+    post, prior = 1e6 * jnp.eye(5)[:2].reshape(2, 1, 1, 5)
+    loss, _ = dynamics_loss(post, prior, **KL)
+    assert np.isfinite(loss).all()
+    for gradient in gradients(post, prior, **KL):
+        assert np.isfinite(gradient).all()
+
+
+def test_dynamics_loss_refuses_a_prior_of_another_shape():
+    with pytest.raises(AssertionError):
+        dynamics_loss(jnp.zeros((2, 3, 4, 5)), jnp.zeros((2, 1, 4, 5)), **KL)
+
+
+def test_symlog_mse_by_hand():
+    target = jnp.array([[0.0, np.e - 1, 1 - np.e**2]])
+    actual = losses.symlog_mse(jnp.array([[1.0, 1.0, 1.0]]), target)
+    np.testing.assert_allclose(actual, [1 + 0 + 9], rtol=1e-6)
+
+
+def test_image_mse_by_hand():
+    target = jnp.array([0, 255, 51], jnp.uint8).reshape(1, 1, 1, 3)
+    prediction = jnp.array([1.0, 1.0, 0.0]).reshape(1, 1, 1, 3)
+    np.testing.assert_allclose(losses.image_mse(prediction, target), [1.04], rtol=1e-6)
+
+
+@pytest.mark.parametrize("logit", [-100.0, -1.0, 0.0, 3.0, 100.0])
+@pytest.mark.parametrize("target", [0.0, 0.997, 1.0])
+def test_continue_loss_is_soft_cross_entropy(logit, target):
+    x = np.float64(logit)
+    twin = target * np.logaddexp(0, -x) + (1 - target) * np.logaddexp(0, x)
+    actual = losses.continue_loss(jnp.array(logit), jnp.array(target))
+    np.testing.assert_allclose(actual, twin, rtol=1e-4, atol=1e-5)
+
+
+def test_continue_loss_is_least_at_the_target():
+    gradient = jax.grad(losses.continue_loss)(jnp.log(332.0), jnp.array(332 / 333))
+    assert gradient == pytest.approx(0.0, abs=1e-6)
+
+
+def predictions(obs_shape):
+    key_obs, key_reward, key_cont = jax.random.split(jax.random.key(0), 3)
+    return (
+        jax.random.uniform(key_obs, (2, 3, *obs_shape)),
+        jax.random.normal(key_reward, (2, 3, 41)),
+        jax.random.normal(key_cont, (2, 3)),
+    )
+
+
+def test_prediction_loss_is_its_three_parts():
+    obs, reward_logits, cont_logit = predictions((7,))
+    target = 5 * jax.random.normal(jax.random.key(1), (2, 3, 7))
+    reward = jnp.arange(6.0).reshape(2, 3) - 2
+    is_terminal = jnp.array([[False, True, False], [False, False, True]])
+    loss = prediction_loss(
+        obs, reward_logits, cont_logit, target, reward, is_terminal, bins=BINS, discount=0.9
+    )
+    cont = jnp.where(is_terminal, 0.0, 0.9)
+    np.testing.assert_allclose(loss.reconstruction, losses.symlog_mse(obs, target), rtol=1e-6)
+    np.testing.assert_allclose(
+        loss.reward, transforms.two_hot_cross_entropy(reward_logits, reward, BINS), rtol=1e-6
+    )
+    np.testing.assert_allclose(loss.cont, losses.continue_loss(cont_logit, cont), rtol=1e-5)
+
+
+def test_prediction_loss_compares_images_as_bytes():
+    obs, reward_logits, cont_logit = predictions((4, 4, 3))
+    target = jax.random.randint(jax.random.key(1), (2, 3, 4, 4, 3), 0, 256).astype(jnp.uint8)
+    loss = prediction_loss(
+        obs,
+        reward_logits,
+        cont_logit,
+        target,
+        jnp.zeros((2, 3)),
+        jnp.zeros((2, 3), bool),
+        bins=BINS,
+        discount=0.9,
+    )
+    np.testing.assert_allclose(loss.reconstruction, losses.image_mse(obs, target), rtol=1e-6)
+
+
+def test_prediction_loss_refuses_rewards_of_another_time():
+    obs, reward_logits, cont_logit = predictions((7,))
+    with pytest.raises(AssertionError):
+        prediction_loss(
+            obs,
+            reward_logits,
+            cont_logit,
+            obs,
+            jnp.zeros((2, 2)),
+            jnp.zeros((2, 2), bool),
+            bins=BINS,
+            discount=0.9,
+        )
+
+
+def test_dynamics_loss_under_jit_equals_eager():
+    post, prior = logits(3.0)
+    for eager, jitted in zip(
+        losses.dynamics_loss(post, prior, **KL), dynamics_loss(post, prior, **KL), strict=True
+    ):
+        np.testing.assert_allclose(eager, jitted, rtol=1e-5)
