@@ -95,9 +95,7 @@ def block_gru_twin(p, h, z, a, blocks):
         [layer(p["from_deter"], h), layer(p["from_stoch"], z), layer(p["from_action"], a)], -1
     )
     parts = np.split(h, blocks, -1)
-    mixed = [
-        np.concatenate([part, x], -1) @ p["mix_kernel"][k] for k, part in enumerate(parts)
-    ]
+    mixed = [np.concatenate([part, x], -1) @ p["mix_kernel"][k] for k, part in enumerate(parts)]
     mixed = silu(rms(np.concatenate(mixed, -1) + p["mix_bias"], p["mix_norm"]))
     biases = np.split(p["gate_bias"], blocks)
     out = []

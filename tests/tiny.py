@@ -1,7 +1,7 @@
 """The one tiny configuration that tests share, so that its update is compiled once.
 
 `CONFIG` is a whole run in miniature: 2 environments, 8 collected steps and one update per
-chunk. `train_step()` hands out the same compiled function to every test that asks.
+chunk, in the probe of `env()`. Replay wraps, and its size does not change with `env_steps`.
 """
 
 from __future__ import annotations
@@ -10,9 +10,10 @@ import dataclasses
 from typing import Any
 
 from vawm import config as config_lib
+from vawm.envs import Environment, probes
 
 CONFIG = config_lib.Config(
-    task="tiny",
+    task="probe_observation_action",
     preset="tiny",
     size="tiny",
     seed=0,
@@ -32,10 +33,15 @@ CONFIG = config_lib.Config(
     imagination=config_lib.ImaginationConfig(horizon=3),
     value_alignment=config_lib.ValueAlignmentConfig(warmup_steps=24),
     optimizer=config_lib.OptimizerConfig(learning_rate=1e-3, warmup_updates=2),
-    replay=config_lib.ReplayConfig(capacity=256, batch_size=2, batch_length=8),
+    replay=config_lib.ReplayConfig(capacity=64, batch_size=2, batch_length=8),
 )
 
 
 def config(**changes: Any) -> config_lib.Config:
     """`CONFIG` with some top-level fields replaced."""
     return dataclasses.replace(CONFIG, **changes)
+
+
+def env() -> Environment:
+    """The environment of `CONFIG`."""
+    return probes.make("observation_action", num_envs=CONFIG.num_envs)

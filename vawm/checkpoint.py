@@ -64,7 +64,11 @@ def read_manifest(logdir: str | os.PathLike[str]) -> tuple[pathlib.Path, Manifes
     """
     path = latest(logdir)
     if path is None:
-        raise InvalidInput("logdir", str(logdir), "holds no checkpoint")
+        raise InvalidInput(
+            "logdir",
+            str(logdir),
+            "holds no checkpoint; name the folder of a run that saved one",
+        )
     return path, manifest_lib.read(path)
 
 
@@ -203,9 +207,7 @@ def _as_leaf(array: np.ndarray | None, like: Any) -> jax.Array:
     if leaf_info(like).impl:
         key = jax.random.wrap_key_data(jnp.array(array))
         if key.dtype != like.dtype:
-            raise ValueError(
-                f"keys of {like.dtype} cannot be restored; use the default generator"
-            )
+            raise ValueError(f"{like.dtype} is not the default kind of key")
         return key
     return jnp.array(array)  # a copy: the memory of numpy could not be donated
 

@@ -12,7 +12,7 @@ import datetime
 import pathlib
 import sys
 from collections.abc import Callable, Sequence
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import tyro
 
@@ -24,13 +24,21 @@ from vawm.errors import InvalidInput
 from vawm.runner import RunError
 
 
-@dataclasses.dataclass(frozen=True)
-class Arguments:
+class Arguments(NamedTuple):
     """What a command line says."""
 
+    config: Config
+    logdir: pathlib.Path
+    resume: bool
+
+
+@dataclasses.dataclass(frozen=True)
+class Flags:
+    """What tyro reads: the fields of `Config`, and these."""
+
     config: Annotated[Config, tyro.conf.arg(name="")]
-    logdir: pathlib.Path = pathlib.Path()
-    """folder of the run (default: runs/<task>/<preset>-seed<seed>-<time>)"""
+    logdir: pathlib.Path | None = None
+    """folder of the run; runs/<task>/<preset>-seed<seed>-<time> if not given"""
     resume: bool = False
     """continue the run in --logdir, with its own settings as defaults"""
 
@@ -43,15 +51,9 @@ def parse(argv: Sequence[str] | None, *, preset: str, description: str) -> Argum
       SystemExit: help was asked for (0), or a flag is unknown or of the wrong type (2).
     """
     argv = list(sys.argv[1:] if argv is None else argv)
-    arguments = tyro.cli(
-        Arguments,
-        args=argv,
-        default=Arguments(_defaults(argv, preset)),
-        description=description,
-    )
-    if arguments.logdir == pathlib.Path():
-        arguments = dataclasses.replace(arguments, logdir=default_logdir(arguments.config))
-    return arguments
+    default = Flags(_defaults(argv, preset))
+    flags = tyro.cli(Flags, args=argv, default=default, description=description)
+    return Arguments(flags.config, flags.logdir or default_logdir(flags.config), flags.resume)
 
 
 def _defaults(argv: list[str], preset: str) -> Config:
@@ -67,8 +69,6 @@ def _defaults(argv: list[str], preset: str) -> Config:
     if known.logdir is None:
         raise InvalidInput("logdir", None, "--resume needs the --logdir of the run")
     saved = checkpoint.read_manifest(known.logdir)[1].config
-    if known.preset not in (None, saved.preset):
-        return validate.preset(known.preset, known.size)
     if known.size not in (None, saved.size):
         validate.check_choice("size", known.size, config_lib.SIZES)
         return config_lib.with_size(saved, known.size)

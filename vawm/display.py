@@ -51,6 +51,7 @@ class Display:
             f"return {shown}  {line['env_steps_per_s']:.0f} steps/s  "
             f"{line['updates_per_s']:.1f} updates/s  {remaining / 60:.0f} min left",
             highlight=False,
+            soft_wrap=True,
         )
 
     def note(self, text: str) -> None:

@@ -54,6 +54,17 @@ class Score(NamedTuple):
         return f"{self.mean:.1f} +- {self.standard_error:.1f} over {count} episodes"
 
 
+class Loop(NamedTuple):
+    """Carry of `play`."""
+
+    env_state: Any
+    timestep: TimeStep
+    carry: Any
+    key: Array
+    done: Array  # [N] whether the first episode is over
+    total: Array  # [N] its return so far
+
+
 def evaluate(
     policy: Policy,
     *,
@@ -90,23 +101,15 @@ def play(env: Environment, policy: Policy, key: Array) -> Array:
     num_envs = env.spec.num_envs
     key_reset, key_act = jax.random.split(key)
 
-    class Loop(NamedTuple):
-        env_state: Any
-        timestep: TimeStep
-        carry: Any
-        step: Array
-        done: Array
-        total: Array
-
     def one_step(loop: Loop) -> Loop:
-        key = jax.random.fold_in(key_act, loop.step)
-        carry, action = policy.act(key, loop.carry, loop.timestep)
+        key, key_act = jax.random.split(loop.key)
+        carry, action = policy.act(key_act, loop.carry, loop.timestep)
         env_state, timestep = env.step(loop.env_state, action)
         return Loop(
             env_state=env_state,
             timestep=timestep,
             carry=carry,
-            step=loop.step + 1,
+            key=key,
             done=loop.done | timestep.is_last,
             total=loop.total + jnp.where(loop.done, 0.0, timestep.reward),
         )
@@ -116,7 +119,7 @@ def play(env: Environment, policy: Policy, key: Array) -> Array:
         env_state=env_state,
         timestep=timestep,
         carry=policy.initial(num_envs),
-        step=jnp.zeros((), jnp.int32),
+        key=key_act,
         done=jnp.zeros(num_envs, bool),
         total=jnp.zeros(num_envs),
     )
@@ -133,17 +136,17 @@ def _evaluate_mujoco(policy: Policy, episodes: int, seed: int) -> Score:
     latest = [sim.reset() for sim in sims]
     total = np.zeros(episodes)
     carry, key = policy.initial(episodes), jax.random.key(seed)
-    steps = 0
+    is_first = True
     while not all(step.last() for step in latest):
-        observed = _as_timestep(latest, steps == 0)
-        carry, action = policy.act(jax.random.fold_in(key, steps), carry, observed)
+        key, key_act = jax.random.split(key)
+        carry, action = policy.act(key_act, carry, _as_timestep(latest, is_first))
         controls = to_actuator(np.asarray(action), specs.minimum, specs.maximum)
         for i, (sim, control) in enumerate(zip(sims, controls, strict=True)):
             for _ in range(policy.spec.action_repeat):
                 if not latest[i].last():
                     latest[i] = sim.step(control)
                     total[i] += latest[i].reward
-        steps += 1
+        is_first = False
     return Score(tuple(map(float, total)))
 
 

@@ -37,7 +37,8 @@ def imagine(
       horizon: H, number of imagined steps.
 
     Returns:
-      `Imagined`: latents `[H + 1, N, ...]`, the first of them `start`, actions `[H, N, A]`.
+      `Imagined`: latents `[H + 1, N, ...]`, the first of them `start`, actions
+      `[H + 1, N, A]`; the last one leads nowhere and only completes the shape.
     """
 
     def step(state, key):
@@ -48,4 +49,4 @@ def imagine(
 
     keys = jax.random.split(key, horizon + 1)
     _, (latent, action) = jax.lax.scan(step, (carry, start), keys)
-    return jax.lax.stop_gradient(Imagined(latent, action[:-1]))
+    return jax.lax.stop_gradient(Imagined(latent, action))

@@ -88,9 +88,9 @@ def config_from_dict(content: dict[str, Any], cls: type = Config) -> Any:
     """
     names = {field.name for field in dataclasses.fields(cls)}
     for name in names ^ content.keys():
-        verb = "is not in the saved config" if name in names else "is not known any more"
+        verb = "was not saved" if name in names else "is not known"
         raise InvalidInput(
-            f"{cls.__name__}.{name}", content.get(name), f"{verb}: other version"
+            f"{cls.__name__}.{name}", content.get(name), f"{verb} (other version)"
         )
     hints = typing.get_type_hints(cls)
     return cls(

@@ -49,7 +49,7 @@ class Linear(nn.Module):
     dtype: jnp.dtype = jnp.float32
 
     def setup(self):
-        init = truncated_normal_in(self.in_features, self.scale) if self.scale else nn.initializers.zeros
+        init = truncated_normal_in(self.in_features, self.scale)
         self.kernel = self.param("kernel", init, (self.in_features, self.out_features))
         self.bias = self.param("bias", nn.initializers.zeros, (self.out_features,))
 
@@ -218,9 +218,7 @@ class RSSM(nn.Module):
 
     def setup(self):
         flat = self.stoch * self.classes
-        self.gru = BlockGRU(
-            self.deter, self.hidden, flat, self.action, self.blocks, self.dtype
-        )
+        self.gru = BlockGRU(self.deter, self.hidden, flat, self.action, self.blocks, self.dtype)
         self.posterior_layer = Layer(self.deter + self.tokens, self.hidden, self.dtype)
         self.posterior_out = Linear(self.hidden, flat, dtype=self.dtype)
         self.prior_net = MLP(

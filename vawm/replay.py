@@ -64,7 +64,9 @@ def pack(latent: Latent) -> Latent:
 
 def unpack(latent: Latent, classes: int) -> Latent:
     """Inverse of `pack`."""
-    return latent._replace(stoch=jax.nn.one_hot(latent.stoch, classes, dtype=latent.deter.dtype))
+    return latent._replace(
+        stoch=jax.nn.one_hot(latent.stoch, classes, dtype=latent.deter.dtype)
+    )
 
 
 def add(replay: Replay, trajectory: Trajectory, latent: Latent) -> Replay:

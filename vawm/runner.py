@@ -25,7 +25,7 @@ from vawm.config import Config
 from vawm.display import Display
 from vawm.envs.protocol import Environment
 from vawm.tracking import Interval, Line
-from vawm.types import Metrics, PyTree
+from vawm.types import PyTree
 
 
 class RunError(RuntimeError):
@@ -69,7 +69,7 @@ class Start(NamedTuple):
 
     env: Environment
     init: Callable[[jax.Array], PyTree]
-    step: Callable[[PyTree], tuple[PyTree, Metrics]]
+    step: jax.stages.Wrapped  # (state) -> (state, metrics), donates
     shapes: PyTree
 
 
@@ -178,7 +178,8 @@ def _loop(
         while progress.env_steps < config.env_steps and stop.signal is None:
             before, began = progress.env_steps, time.perf_counter()
             state, metrics = step(state)
-            progress = advance(progress, jax.device_get(metrics), began=began)
+            metrics = jax.device_get(metrics)
+            progress = advance(progress, metrics, began=began)
             _stop_if_nonfinite(metrics, progress, tracker, last_saved)
             done = progress.env_steps >= config.env_steps
             if _crossed(before, progress.env_steps, config.log_every):

@@ -14,15 +14,14 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from vawm import losses, optim, replay, returns, transforms
+from vawm import optim, replay, returns
 from vawm.agent import Agent, PolicyCarry
 from vawm.config import Config
 from vawm.envs.protocol import Environment
-from vawm.imagination import imagine
+from vawm.objective import Batch, make_behaviour_loss, make_world_model_loss
 from vawm.replay import Replay
 from vawm.types import (
     Array,
-    Inference,
     Key,
     Latent,
     Metrics,
@@ -31,13 +30,6 @@ from vawm.types import (
     TimeStep,
     Trajectory,
 )
-
-
-class Batch(NamedTuple):
-    """Replayed experience: T + 1 steps, the first of which only gives context."""
-
-    trajectory: Trajectory  # [B, T + 1, ...]
-    context: Latent  # [B, ...] the stored latent of step 0
 
 
 class Learner(NamedTuple):
@@ -106,7 +98,12 @@ def make_update(agent: Agent, config: Config) -> Update:
             params, learner.slow_critic, batch, key_observe, step
         )
         agent_loss, return_scale, agent_metrics = behaviour_loss(
-            params, learner, batch, inference, key_behaviour
+            params,
+            learner.slow_critic,
+            learner.return_scale,
+            batch,
+            inference,
+            key_behaviour,
         )
         total = model_loss + agent_loss
         metrics = model_metrics | agent_metrics | {"loss/total": total}
@@ -121,8 +118,8 @@ def make_update(agent: Agent, config: Config) -> Update:
         updates, opt_state = optimizer.update(gradient, learner.opt_state, learner.params)
         params = optax.apply_updates(learner.params, updates)
         rate = config.critic.slow_rate
-        metrics["optimizer/gradient_norm"] = optax.global_norm(gradient)
-        metrics["optimizer/update_norm"] = optax.global_norm(updates)
+        metrics["optimizer/gradient_norm"] = optax.tree.norm(gradient)
+        metrics["optimizer/update_norm"] = optax.tree.norm(updates)
         return (
             Learner(
                 step=learner.step + 1,
@@ -136,202 +133,6 @@ def make_update(agent: Agent, config: Config) -> Update:
         )
 
     return update
-
-
-def make_world_model_loss(agent: Agent, config: Config):
-    """Eq. 2: prediction, dynamics and value alignment of a batch.
-
-    Gradients reach the world model only; L_var reads the critic with its parameters
-    stopped, the same parameters for both latents.
-    """
-    model, alignment = config.world_model, config.value_alignment
-    reward_bins = transforms.symexp_bins(model.bins)
-    discount = 1.0 - 1.0 / config.imagination.discount_horizon
-
-    def value_alignment(
-        params: Params, slow_critic: PyTree, inference: Inference, kl: Array, step: Array
-    ) -> tuple[Array, Array]:
-        critic = params.critic if alignment.critic == "online" else slow_critic
-        critic = jax.lax.stop_gradient(critic)
-        latent, prior_latent = inference.latent, inference.prior_latent
-        if alignment.deter_gradient == "stop":
-            deter = jax.lax.stop_gradient(latent.deter)
-            latent = latent._replace(deter=deter)
-            prior_latent = prior_latent._replace(deter=deter)
-        loss = losses.value_alignment_loss(
-            agent.critic.logits(critic, latent),
-            agent.critic.logits(critic, prior_latent),
-            dynamics_scale=alignment.dynamics_scale,
-            representation_scale=alignment.representation_scale,
-        )
-        weight = alignment_weight(kl, step)
-        return loss * inference.has_prior, weight * inference.has_prior
-
-    def alignment_weight(kl: Array, step: Array) -> Array:
-        if alignment.weight == "off":
-            return jnp.zeros_like(kl)
-        if alignment.weight == "static":
-            gate = (step > alignment.warmup_steps).astype(kl.dtype)
-            return jnp.full_like(kl, alignment.static_weight) * gate
-        return losses.value_alignment_weight(kl, step, warmup_steps=alignment.warmup_steps)
-
-    def loss_fn(params: Params, slow_critic: PyTree, batch: Batch, key: Key, step: Array):
-        steps = jax.tree.map(lambda x: x[:, 1:], batch.trajectory)
-        prev_action = batch.trajectory.action[:, :-1]
-        # 1. Explain the batch: what is it, and what could have been predicted?
-        _, inference = agent.world_model.observe(
-            params.world_model,
-            key,
-            batch.context,
-            steps.obs,
-            prev_action,
-            steps.is_first,
-            train=True,
-        )
-        predictions = agent.world_model.predict(params.world_model, inference.latent)
-        # 2. Maximum likelihood, Eq. 3.
-        prediction = losses.prediction_loss(
-            predictions.obs,
-            predictions.reward,
-            predictions.cont,
-            steps.obs,
-            steps.reward,
-            steps.is_terminal,
-            bins=reward_bins,
-            discount=discount,
-        )
-        dynamics, kl = losses.dynamics_loss(
-            inference.post_logits,
-            inference.prior_logits,
-            unimix=model.unimix,
-            free_nats=model.free_nats,
-            dynamics_scale=model.dynamics_scale,
-            representation_scale=model.representation_scale,
-        )
-        # 3. Value alignment, Eq. 4 and 5.
-        aligned, weight = value_alignment(params, slow_critic, inference, kl, step)
-        parts = {
-            "loss/reconstruction": model.reconstruction_scale * prediction.reconstruction,
-            "loss/reward": prediction.reward,
-            "loss/continue": prediction.cont,
-            "loss/dynamics": dynamics,
-            "loss/value_alignment": weight * aligned,
-        }
-        parts = {name: jnp.mean(part) for name, part in parts.items()}
-        metrics = parts | {
-            "value_alignment/loss": jnp.mean(aligned),
-            "value_alignment/weight": jnp.mean(weight),
-            "latent/kl": jnp.mean(kl),
-        }
-        return sum(parts.values()), inference, metrics
-
-    return loss_fn
-
-
-def make_behaviour_loss(agent: Agent, config: Config):
-    """Eq. 7 and 8: critic and actor from imagination, critic from replay.
-
-    Imagined latents carry no gradient; the replay value loss reaches the world model
-    unless `critic.replay_gradient` is off.
-    """
-    imagination, critic_config = config.imagination, config.critic
-    discount = 1.0 - 1.0 / imagination.discount_horizon
-    reward_bins = transforms.symexp_bins(config.world_model.bins)
-    actor, critic, world_model = agent.actor, agent.critic, agent.world_model
-
-    def critic_loss(logits: Array, slow_logits: Array, target: Array) -> Array:
-        return losses.critic_loss(
-            logits,
-            critic.mean(slow_logits),
-            target,
-            bins=critic.bins,
-            slow_scale=critic_config.slow_scale,
-        )
-
-    def loss_fn(params: Params, learner: Learner, batch: Batch, inference: Inference, key: Key):
-        frozen = jax.lax.stop_gradient(params)
-        steps = jax.tree.map(lambda x: x[:, 1:], batch.trajectory)
-        key_starts, key_imagine = jax.random.split(key)
-        # 4. Imagine H steps from every state of the batch.
-        carry, start = world_model.starts(
-            frozen.world_model, key_starts, batch.trajectory, inference
-        )
-        imagined = imagine(
-            world_model,
-            lambda latent: actor.policy(frozen.actor, latent),
-            frozen.world_model,
-            key_imagine,
-            carry,
-            start,
-            horizon=imagination.horizon,
-        )
-        # 5. Lambda-returns and their scale, Eq. 7 and 9.
-        predictions = world_model.predict(frozen.world_model, imagined.latent)
-        reward = transforms.two_hot_mean(predictions.reward, reward_bins)
-        cont = jax.nn.sigmoid(predictions.cont)
-        logits = critic.logits(params.critic, imagined.latent)
-        value = critic.mean(jax.lax.stop_gradient(logits))
-        weight = losses.discount_weights(cont)[:-1]
-        target = returns.lambda_returns(
-            reward[1:], cont[1:], value[1:], lambda_=imagination.lambda_
-        )
-        scale_state = returns.update_return_scale(
-            learner.return_scale,
-            target,
-            decay=imagination.return_scale_decay,
-            low=imagination.return_scale_low,
-            high=imagination.return_scale_high,
-        )
-        scale = returns.return_scale(scale_state, limit=imagination.return_scale_limit)
-        advantage = (target - value[:-1]) / scale
-        # 6. Critic and actor, Eq. 7 and 8; the critic also from replay.
-        before_last = jax.tree.map(lambda x: x[:-1], imagined.latent)
-        slow_logits = critic.logits(learner.slow_critic, before_last)
-        policy = actor.policy(params.actor, before_last)
-        entropy = policy.entropy()
-        replay_latent = inference.latent
-        if not critic_config.replay_gradient:
-            replay_latent = jax.lax.stop_gradient(replay_latent)
-        replay_target = returns.replay_returns(
-            steps.reward,
-            steps.is_last,
-            steps.is_terminal,
-            target[0].reshape(steps.reward.shape),
-            discount=discount,
-            lambda_=imagination.lambda_,
-        )
-        replay_loss = critic_loss(
-            critic.logits(params.critic, replay_latent)[:, :-1],
-            critic.logits(learner.slow_critic, jax.lax.stop_gradient(replay_latent))[:, :-1],
-            replay_target,
-        )
-        parts = {
-            "loss/actor": config.actor.scale
-            * weight
-            * losses.actor_loss(
-                policy.log_prob(imagined.action),
-                entropy,
-                advantage,
-                entropy_scale=config.actor.entropy_scale,
-            ),
-            "loss/critic": critic_config.scale
-            * weight
-            * critic_loss(logits[:-1], slow_logits, target),
-            "loss/replay_critic": critic_config.replay_scale
-            * (1.0 - steps.is_last[:, :-1])
-            * replay_loss,
-        }
-        parts = {name: jnp.mean(part) for name, part in parts.items()}
-        metrics = parts | {
-            "policy/entropy": jnp.mean(entropy),
-            "imagination/reward": jnp.mean(reward[1:]),
-            "imagination/return": jnp.mean(target),
-            "imagination/value": jnp.mean(value),
-            "imagination/return_scale": scale,
-        }
-        return sum(parts.values()), scale_state, metrics
-
-    return loss_fn
 
 
 def make_collect(env: Environment, agent: Agent, config: Config) -> Collect:
@@ -406,21 +207,20 @@ def make_train_step(env: Environment, agent: Agent, config: Config) -> TrainStep
         return Batch(trajectory, context), positions._replace(time=positions.time[:, 1:])
 
     def learn(learner: Learner, buffer: Replay, key: Key, env_steps: Array, due: Array):
-        keys = jax.random.split(key, 2)
-        _, _, shapes = jax.eval_shape(
-            update, learner, jax.eval_shape(draw, buffer, key)[0], key, env_steps
-        )
-        sums = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+        batch, _ = jax.eval_shape(draw, buffer, key)
+        metrics = jax.eval_shape(update, learner, batch, key, env_steps)[-1]
+        sums = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), metrics)
 
-        def one_update(i: Array, state: tuple[Learner, Replay, Metrics]):
-            learner, buffer, sums = state
-            key_draw, key_update = (jax.random.fold_in(k, i) for k in keys)
+        def one_update(_, state: tuple[Learner, Replay, Key, Metrics]):
+            learner, buffer, key, sums = state
+            key, key_draw, key_update = jax.random.split(key, 3)
             batch, positions = draw(buffer, key_draw)
             learner, latent, metrics = update(learner, batch, key_update, env_steps)
             buffer = replay.write_back(buffer, positions, latent)
-            return learner, buffer, jax.tree.map(jnp.add, sums, metrics)
+            return learner, buffer, key, jax.tree.map(jnp.add, sums, metrics)
 
-        learner, buffer, sums = jax.lax.fori_loop(0, due, one_update, (learner, buffer, sums))
+        state = learner, buffer, key, sums
+        learner, buffer, _, sums = jax.lax.fori_loop(0, due, one_update, state)
         return learner, buffer, jax.tree.map(lambda x: x / due, sums)
 
     def train_step(state: TrainState) -> tuple[TrainState, Metrics]:
@@ -468,9 +268,7 @@ def init(env: Environment, agent: Agent, config: Config, key: Key) -> TrainState
             episode_return=jnp.zeros(config.num_envs),
             episode_length=jnp.zeros(config.num_envs, jnp.int32),
         ),
-        replay=replay.init(
-            example, carry.latent, capacity=replay.capacity_per_env(config)
-        ),
+        replay=replay.init(example, carry.latent, capacity=replay.capacity_per_env(config)),
         credit=jnp.zeros((), jnp.int32),
         key=key,
     )

@@ -143,10 +143,9 @@ def _check_replay(config: Config) -> None:
             f"{replay.batch_size} x {replay.batch_length}"
         )
         raise InvalidInput("replay.capacity", replay.capacity, remedy)
-    if config.collect_steps > replay.capacity // config.num_envs:
-        remedy = (
-            f"use at most replay.capacity / num_envs = {replay.capacity // config.num_envs}"
-        )
+    per_env = replay.capacity // config.num_envs
+    if config.collect_steps > per_env:
+        remedy = f"use at most {per_env}, replay.capacity / num_envs"
         raise InvalidInput("collect_steps", config.collect_steps, remedy)
     needed_env_steps = needed * config.num_envs * config.action_repeat
     if config.env_steps < needed_env_steps:

@@ -7,7 +7,7 @@ happens at the first `reset` and `step`.
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import jax
@@ -24,7 +24,7 @@ from vawm.types import EnvSpec, TimeStep
 class SingleEnv(gymnasium.Env):
     """One environment, NumPy in and out."""
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": []}
+    metadata = {"render_modes": []}  # noqa: RUF012 (an instance variable of the base)
 
     def __init__(self, task: str, action_repeat: int = 1):
         self._env = compiled(envs.make(task, num_envs=1, action_repeat=action_repeat))
@@ -50,7 +50,7 @@ class SingleEnv(gymnasium.Env):
 class BatchedEnv(VectorEnv):
     """N environments in one compiled call, reset at the step after an episode's last."""
 
-    metadata: ClassVar[dict[str, Any]] = {
+    metadata = {  # noqa: RUF012
         "render_modes": [],
         "autoreset_mode": AutoresetMode.NEXT_STEP,
     }

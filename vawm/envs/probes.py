@@ -25,6 +25,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from vawm.envs.protocol import Environment, EnvState, check_positive
 from vawm.errors import InvalidInput
@@ -122,7 +123,12 @@ def make(name: str, *, num_envs: int, episode_length: int = 4) -> Environment:
 
 
 def known_value(
-    name: str, *, steps: Array, signal: Array = 0.0, discount: float, episode_length: int
+    name: str,
+    *,
+    steps: ArrayLike,
+    signal: ArrayLike = 0.0,
+    discount: float,
+    episode_length: int,
 ) -> np.ndarray:
     """The optimal value V*(o_t), in closed form, at t = `steps` < T.
 
@@ -141,15 +147,15 @@ def known_value(
       `[...]` float64 values.
     """
     check_probe(name)
-    steps, signal = np.broadcast_arrays(np.asarray(steps), np.asarray(signal, float))
+    t, visible_signal = np.broadcast_arrays(np.asarray(steps), np.asarray(signal, float))
     kind = name.removesuffix("_discrete")
     if kind == "truncation":
-        return np.full(steps.shape, 1 / (1 - discount))
+        return np.full(t.shape, 1 / (1 - discount))
     if kind in ("discounting", "memory"):
-        return discount ** (episode_length - 1.0 - steps)
+        return discount ** (episode_length - 1.0 - t)
     if kind == "observation_reward":
-        return signal
-    return (1 - discount ** (episode_length - 1.0 * steps)) / (1 - discount)
+        return visible_signal
+    return (1 - discount ** (episode_length - 1.0 * t)) / (1 - discount)
 
 
 def optimal_action(name: str, target: Array) -> Array:

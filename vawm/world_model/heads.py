@@ -36,7 +36,9 @@ def vector_heads(config: WorldModelConfig, spec: EnvSpec, dtype: jnp.dtype) -> H
     `bins` logits with zero initial output, the continue head one logit.
     """
     if len(spec.obs_shape) != 1:
-        raise InvalidInput("obs_shape", spec.obs_shape, "vector observations have one dimension")
+        raise InvalidInput(
+            "obs_shape", spec.obs_shape, "vector observations have one dimension"
+        )
     features = config.deter + config.stoch * config.classes
     units = config.units
 

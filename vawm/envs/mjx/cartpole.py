@@ -48,7 +48,7 @@ def make_task(name: str, model: mujoco.MjModel) -> Task:
 def draw_hanging(key: Key) -> Start:
     """Near the middle and pointing down: N(0, 0.01) around (0, pi)."""
     key_qpos, key_qvel = jax.random.split(key)
-    hanging = np.array([0.0, np.pi], np.float32)
+    hanging = jnp.array([0.0, np.pi])
     qpos = hanging + 0.01 * jax.random.normal(key_qpos, (2,))
     return Start(qpos, 0.01 * jax.random.normal(key_qvel, (2,)), no_target())
 

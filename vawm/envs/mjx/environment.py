@@ -46,22 +46,23 @@ def batch(
     """
     model, blank, host = loaded
     low, high = np.asarray(host.actuator_ctrlrange, np.float32).T
-    action_size = host.nu
+    spec = EnvSpec(
+        task=name,
+        obs_shape=obs_shape(task, blank),
+        obs_dtype="float32",
+        action_size=host.nu,
+        discrete=False,
+        num_envs=num_envs,
+        action_repeat=action_repeat,
+        episode_length=EPISODE_STEPS // action_repeat,
+    )
 
-    def simulate(data: mjx.Data, target: Array, action: Array):
-        """`action_repeat` control steps of one environment; rewards are summed."""
+    def begin(key: Key) -> tuple[mjx.Data, Array]:
+        return first_state(task, model, blank, key)
+
+    def act(data: mjx.Data, target: Array, action: Array):
         ctrl = rescale(action, low, high)
-
-        def control_step(carry):
-            data, reward = carry
-            data = physics.control_step(model, data, ctrl, substeps=task.substeps)
-            return physics.keep(blank, data), reward + task.reward(data, target)
-
-        start = physics.keep(blank, data), jnp.float32(0)
-        data, reward = physics.repeat(control_step, start, action_repeat)
-        obs = task.observe(data, target)
-        sound = physics.healthy(data) & jnp.isfinite(obs).all() & jnp.isfinite(reward)
-        return data, reward, sound
+        return simulate(task, model, blank, data, target, ctrl, action_repeat=action_repeat)
 
     def renew(state: EnvState, due: Array) -> EnvState:
         """Starts a new episode where `due`; all keys move on when any does."""
@@ -84,12 +85,10 @@ def batch(
 
         return jax.lax.while_loop(anyone_due, body, (state, due, jnp.int32(0)))[0]
 
-    def begin(key: Key) -> tuple[mjx.Data, Array]:
-        """A fresh state of one environment, as after `dm_control`'s `reset`."""
-        return first_state(task, model, blank, key)
-
     def observe(state: EnvState) -> Array:
-        return jax.vmap(task.observe)(state.data, state.target)
+        obs = jax.vmap(task.observe)(state.data, state.target)
+        # The data is sound by induction; only a state edited from outside can be not.
+        return jnp.where(jnp.isfinite(obs), obs, 0.0)
 
     def reset(key: Key) -> tuple[EnvState, TimeStep]:
         target = jax.eval_shape(task.draw, key).target
@@ -110,9 +109,9 @@ def batch(
         )
 
     def step(state: EnvState, action: Array) -> tuple[EnvState, TimeStep]:
-        chex.assert_shape(action, (num_envs, action_size))
+        chex.assert_shape(action, (num_envs, spec.action_size))
         due = over(state.steps)
-        data, reward, sound = jax.vmap(simulate)(state.data, state.target, action)
+        data, reward, sound = jax.vmap(act)(state.data, state.target, action)
         failed = ~sound & ~due
         steps = state.steps + action_repeat
         state = EnvState(
@@ -130,20 +129,35 @@ def batch(
             is_terminal=jnp.zeros(num_envs, bool),
         )
 
-    return Environment(
-        spec=EnvSpec(
-            task=name,
-            obs_shape=obs_shape(task, blank),
-            obs_dtype="float32",
-            action_size=action_size,
-            discrete=False,
-            num_envs=num_envs,
-            action_repeat=action_repeat,
-            episode_length=EPISODE_STEPS // action_repeat,
-        ),
-        reset=reset,
-        step=step,
-    )
+    return Environment(spec=spec, reset=reset, step=step)
+
+
+def simulate(
+    task: Task,
+    model: mjx.Model,
+    blank: mjx.Data,
+    data: mjx.Data,
+    target: Array,
+    ctrl: Array,
+    *,
+    action_repeat: int,
+) -> tuple[mjx.Data, Array, Array]:
+    """`action_repeat` control steps of one environment.
+
+    Returns:
+      The new state, the sum of the rewards, and whether all of it is finite.
+    """
+
+    def control_step(carry):
+        data, reward = carry
+        data = physics.control_step(model, data, ctrl, substeps=task.substeps)
+        return physics.keep(blank, data), reward + task.reward(data, target)
+
+    start = physics.keep(blank, data), jnp.float32(0)
+    data, reward = physics.repeat(control_step, start, action_repeat)
+    obs = task.observe(data, target)
+    sound = physics.healthy(data) & jnp.isfinite(obs).all() & jnp.isfinite(reward)
+    return data, reward, sound
 
 
 def first_state(
@@ -190,6 +204,7 @@ def over(steps: Array) -> Array:
 
 def rescale(action: Array, low: np.ndarray, high: np.ndarray) -> Array:
     """Clips to [-1, 1] and maps linearly onto `[low, high]`; NaN counts as 0."""
+    action = jnp.asarray(action, jnp.float32)
     action = jnp.clip(jnp.where(jnp.isnan(action), 0.0, action), -1.0, 1.0)
     return (high + low) / 2 + action * ((high - low) / 2)
 

@@ -66,7 +66,9 @@ def load_host(domain: str) -> mujoco.MjModel:
     refuses, is cleared; integrator, timestep, cone and eulerdamp stay.
     """
     spec = importlib.util.find_spec("dm_control.suite")
-    folder = pathlib.Path(next(iter(spec.submodule_search_locations)))
+    if spec is None or not spec.origin:
+        raise ImportError("dm_control.suite is not installed")
+    folder = pathlib.Path(spec.origin).parent
     assets = {
         f"./common/{path.name}": path.read_bytes() for path in folder.glob("common/*.xml")
     }

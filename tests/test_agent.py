@@ -1,0 +1,104 @@
+"""Parameter counts of the official code, and acting."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import tiny
+
+from vawm.agent import make_agent, parameter_count, resolve_dtype
+from vawm.config import PAPER, with_size
+from vawm.types import EnvSpec, TimeStep
+
+# The official DreamerV3's counts for 24 observations and 6 continuous actions.
+OFFICIAL = {
+    "1m": {
+        "total": 640_867,
+        "encoder": 10_112,
+        "rssm": 364_416,
+        "decoder": 51_096,
+        "reward": 57_663,
+        "cont": 41_153,
+        "actor": 50_316,
+        "critic": 66_111,
+    },
+    "12m": {
+        "total": 9_738_019,
+        "encoder": 138_752,
+        "rssm": 5_783_040,
+        "decoder": 794_136,
+        "reward": 721_407,
+        "cont": 656_129,
+        "actor": 791_052,
+        "critic": 853_503,
+    },
+    "25m": {"total": 21_782_947},
+}
+
+
+def spec(discrete=False):
+    return EnvSpec("test", (24,), "float32", 6, discrete, 1, 1, None)
+
+
+@pytest.mark.parametrize("size", OFFICIAL)
+def test_parameter_counts_are_the_official_ones(size):
+    agent = make_agent(with_size(PAPER, size), spec())
+    params = jax.eval_shape(agent.init, jax.random.key(0))
+    actual = {name: parameter_count(part) for name, part in params.world_model.items()}
+    actual |= {"actor": parameter_count(params.actor), "critic": parameter_count(params.critic)}
+    actual["total"] = parameter_count(params)
+    assert {name: actual[name] for name in OFFICIAL[size]} == OFFICIAL[size]
+
+
+def observation(agent, is_first, is_last):
+    flags = jnp.array(is_first), jnp.array(is_last)
+    obs = jnp.array([[0.5, 1.0], [-2.0, 0.0]])
+    return TimeStep(obs, jnp.zeros(2), *flags, jnp.zeros(2, bool))
+
+
+def test_acting_is_pure_and_depends_on_the_key():
+    agent = make_agent(tiny.CONFIG, tiny.env().spec)
+    params, carry = agent.init(jax.random.key(0)), agent.initial(2)
+    timestep = observation(agent, [True, True], [False, False])
+    act = jax.jit(agent.act)
+    first = act(params, jax.random.key(1), carry, timestep)
+    again = act(params, jax.random.key(1), carry, timestep)
+    other = act(params, jax.random.key(2), carry, timestep)
+    jax.tree.map(np.testing.assert_array_equal, first, again)
+    assert (first[1] != other[1]).all()
+
+
+def test_nothing_leaves_from_a_last_observation():
+    agent = make_agent(tiny.CONFIG, tiny.env().spec)
+    params, carry = agent.init(jax.random.key(0)), agent.initial(2)
+    timestep = observation(agent, [False, False], [True, False])
+    carry, action = agent.act(params, jax.random.key(1), carry, timestep)
+    assert (action[0] == 0).all()
+    assert (action[1] != 0).all()
+    np.testing.assert_array_equal(carry.action, action)
+
+
+def test_a_first_observation_clears_what_was_remembered():
+    agent = make_agent(tiny.CONFIG, tiny.env().spec)
+    params, fresh = agent.init(jax.random.key(0)), agent.initial(2)
+    full = jax.tree.map(jnp.ones_like, fresh)
+    timestep = observation(agent, [True, False], [False, False])
+    _, expected = agent.act(params, jax.random.key(1), fresh, timestep)
+    _, actual = agent.act(params, jax.random.key(1), full, timestep)
+    np.testing.assert_array_equal(actual[0], expected[0])
+    assert (actual[1] != expected[1]).any()
+
+
+def test_a_discrete_actor_gives_one_hot_actions():
+    agent = make_agent(tiny.CONFIG, tiny.env().spec._replace(discrete=True, action_size=3))
+    timestep = observation(agent, [True, True], [False, False])
+    _, action = agent.act(
+        agent.init(jax.random.key(0)), jax.random.key(1), agent.initial(2), timestep
+    )
+    assert action.shape == (2, 3)
+    np.testing.assert_array_equal(np.sort(action, -1), [[0, 0, 1]] * 2)
+
+
+def test_the_compute_dtype_is_float32_on_cpu_unless_asked_otherwise():
+    assert jax.default_backend() != "cpu" or resolve_dtype("auto") == jnp.float32
+    assert resolve_dtype("bfloat16") == jnp.bfloat16

@@ -1,0 +1,142 @@
+"""Checkpoints: bit for bit, all or nothing, never a silent difference."""
+
+import errno
+import shutil
+
+import jax
+import jax.numpy as jnp
+import pytest
+import tiny
+import toy
+
+from vawm import checkpoint, manifest
+from vawm.errors import InvalidInput
+
+PROGRESS = {"env_steps": 8, "seconds": 1 / 3}
+
+
+def save(logdir, state, env_steps=8):
+    return checkpoint.save(
+        logdir,
+        state,
+        env_steps=env_steps,
+        config=tiny.CONFIG,
+        spec=toy.SPEC,
+        progress=PROGRESS,
+    )
+
+
+def files_of(path):
+    return sorted(file for file in path.rglob("*") if file.is_file() and file.stat().st_size)
+
+
+def test_everything_comes_back_bit_for_bit(tmp_path):
+    state = toy.state()
+    save(tmp_path, state)
+    restored, saved = checkpoint.restore(tmp_path, jax.eval_shape(lambda: state))
+    toy.assert_equal(restored, state)
+    assert saved.config == tiny.CONFIG
+    assert saved.spec == toy.SPEC
+    assert saved.progress == PROGRESS
+    assert saved.env_steps == 8
+
+
+def test_parameters_are_read_without_the_rest(tmp_path):
+    state = toy.state()
+    shutil.rmtree(save(tmp_path, state) / "state")
+    params, _ = checkpoint.restore_params(
+        tmp_path, jax.eval_shape(lambda: state.learner.params)
+    )
+    toy.assert_equal(params, state.learner.params)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda s: s._replace(env_steps=jnp.zeros(2, jnp.int32)), r"\.env_steps is int32\[\]"),
+        (lambda s: s._replace(env_steps=jnp.zeros(())), r"expected float32\[\]"),
+        (lambda s: s._replace(key=jnp.zeros((2, 2), jnp.uint32)), r"\.key is key<fry>\[2\]"),
+        (lambda s: s._replace(replay={"more": s.env_steps, **s.replay}), "is missing"),
+        (lambda s: s._replace(replay={}), "expected nothing; .* and 1 more leaves"),
+    ],
+)
+def test_a_leaf_that_differs_is_named(tmp_path, change, message):
+    save(tmp_path, toy.state())
+    with pytest.raises(InvalidInput, match=message):
+        checkpoint.restore(tmp_path, change(toy.state()))
+
+
+def test_another_width_is_refused_with_both_shapes(tmp_path):
+    save(tmp_path, toy.state(width=3))
+    with pytest.raises(InvalidInput, match=r"float32\[2,3\], expected float32\[2,4\]"):
+        checkpoint.restore(tmp_path, toy.state(width=4))
+
+
+@pytest.mark.parametrize("harm", ["flip", "truncate", "delete"])
+def test_damage_to_any_file_is_told_by_its_name(tmp_path, harm):
+    path = save(tmp_path / "run", toy.state())
+    for file in files_of(path):
+        shutil.copytree(tmp_path / "run", tmp_path / "copy")
+        harmed = tmp_path / "copy" / file.relative_to(tmp_path / "run")
+        content = bytearray(harmed.read_bytes())
+        content[len(content) // 2] ^= 1
+        if harm == "flip":
+            harmed.write_bytes(content)
+        elif harm == "truncate":
+            harmed.write_bytes(content[:-1])
+        else:
+            harmed.unlink()
+        with pytest.raises(InvalidInput, match=f"damaged|{manifest.DIGEST}") as error:
+            checkpoint.restore(tmp_path / "copy", toy.state())
+        assert harmed.name in str(error.value) or harmed.name == manifest.DIGEST
+        shutil.rmtree(tmp_path / "copy")
+
+
+def test_only_the_newest_is_kept(tmp_path):
+    for env_steps in (8, 16, 120):
+        save(tmp_path, toy.state(env_steps), env_steps)
+    assert [path.name for path in checkpoint.root(tmp_path).iterdir()] == ["000000000120"]
+    restored, _ = checkpoint.restore(tmp_path, toy.state())
+    toy.assert_equal(restored, toy.state(120))
+
+
+def test_an_unfinished_checkpoint_is_ignored_and_swept_away(tmp_path):
+    first = save(tmp_path, toy.state())
+    shutil.copytree(first, first.with_name(checkpoint.SCRATCH + "000000000016"))
+    assert checkpoint.latest(tmp_path) == first
+    second = save(tmp_path, toy.state(), 24)
+    assert list(checkpoint.root(tmp_path).iterdir()) == [second]
+
+
+def test_a_full_disk_leaves_the_previous_checkpoint_alone(tmp_path, monkeypatch):
+    first = save(tmp_path, toy.state())
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(manifest, "write", full)
+    with pytest.raises(checkpoint.SaveError, match=r"MiB needed, .* MiB free.*No space left"):
+        save(tmp_path, toy.state(1), 16)
+    monkeypatch.undo()
+    assert list(checkpoint.root(tmp_path).iterdir()) == [first]
+    toy.assert_equal(checkpoint.restore(tmp_path, toy.state())[0], toy.state())
+
+
+def test_parameters_that_are_not_finite_are_not_saved(tmp_path):
+    state = toy.state()
+    params = state.learner.params._replace(actor={"bias": jnp.array([jnp.nan])})
+    with pytest.raises(checkpoint.SaveError, match=r"\.actor\['bias'\] is not finite"):
+        save(tmp_path, state._replace(learner=state.learner._replace(params=params)))
+    assert checkpoint.latest(tmp_path) is None
+
+
+def test_no_checkpoint_is_said(tmp_path):
+    with pytest.raises(InvalidInput, match="holds no checkpoint"):
+        checkpoint.restore(tmp_path, toy.state())
+
+
+def test_a_config_survives_json():
+    content = checkpoint.manifest_lib.config_lib.as_dict(tiny.CONFIG)
+    assert manifest.config_from_dict(content) == tiny.CONFIG
+    with pytest.raises(InvalidInput, match=r"Config\.colour=.*not known"):
+        manifest.config_from_dict(content | {"colour": 1})

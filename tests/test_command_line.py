@@ -1,0 +1,178 @@
+"""Flags, defaults in two phases, and one line for every kind of bad input."""
+
+import importlib.util
+import pathlib
+
+import pytest
+import tiny
+import toy
+
+from vawm import cache, checkpoint, command_line, runner
+from vawm import config as config_lib
+from vawm.errors import InvalidInput
+
+EXPERIMENT = pathlib.Path(__file__).parents[1] / "experiments" / "dmc_proprio.py"
+
+
+def parse(*flags):
+    return command_line.parse(flags, preset="quick", description="")
+
+
+@pytest.fixture
+def experiment(monkeypatch, tmp_path):
+    """The `main` of the experiment, in an empty folder, with nothing trained."""
+    spec = importlib.util.spec_from_file_location("dmc_proprio", EXPERIMENT)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    monkeypatch.setattr(cache, "enable", lambda: None)
+    monkeypatch.chdir(tmp_path)
+
+    def run(config, logdir, **_):
+        return runner.Result(logdir, config.env_steps, 0)
+
+    monkeypatch.setattr(runner, "run", run)
+    return lambda *flags: command_line.guard(lambda: module.main(flags))
+
+
+@pytest.fixture
+def saved(tmp_path):
+    """The folder of a run with unusual choices."""
+    logdir = tmp_path / "saved"
+    config = tiny.config(task="walker_run", preset="quick", size="1m", seed=7)
+    checkpoint.save(
+        logdir, toy.state(), env_steps=48, config=config, spec=toy.SPEC, progress={}
+    )
+    return logdir, config
+
+
+def test_the_defaults_are_the_preset():
+    assert parse().config == config_lib.QUICK
+    assert parse("--preset", "paper").config == config_lib.PAPER
+    assert parse("--preset=paper", "--size=25m").config == config_lib.with_size(
+        config_lib.PAPER, "25m"
+    )
+
+
+def test_other_flags_override_preset_and_size_in_any_order():
+    config = parse(
+        *("--world-model.deter", "256", "--value-alignment.weight", "off"),
+        *("--critic.no-replay-gradient", "--env_steps", "5000", "--seed", "3"),
+        *("--imagination.lambda_", "0.9", "--size", "12m", "--preset", "quick"),
+    ).config
+    assert config.world_model.deter == 256
+    assert config.world_model.units == 256  # of size 12m
+    assert config.value_alignment.weight == "off"
+    assert not config.critic.replay_gradient
+    assert (config.env_steps, config.seed, config.imagination.lambda_) == (5000, 3, 0.9)
+    assert config.num_envs == config_lib.QUICK.num_envs
+
+
+def test_every_field_of_the_config_is_a_flag(capsys):
+    with pytest.raises(SystemExit, match="0"):
+        parse("--help")
+    text = capsys.readouterr().out
+    for name, _ in command_line.validate.values(config_lib.PAPER):
+        flag = "--" + name.replace("_", "-").replace("lambda-", "lambda_")
+        assert flag in text, flag
+
+
+def test_a_run_gets_a_folder_of_its_own():
+    assert parse("--logdir", "here").logdir == pathlib.Path("here")
+    parts = parse("--task", "walker_walk", "--seed", "2").logdir.parts
+    assert parts[:2] == ("runs", "walker_walk")
+    assert parts[2].startswith("quick-seed2-")
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--task", "walker_wlak"], "task='walker_wlak': did you mean 'walker_walk'"),
+        (["--preset", "papers"], "preset='papers': did you mean 'paper'"),
+        (["--size", "13m"], "size='13m': did you mean"),
+        (["--env-steps", "0"], "env_steps=0: use a number above 0"),
+        (["--replay.capacity", "100"], "replay.capacity=100: use at least"),
+        (["--resume"], "logdir=None: --resume needs the --logdir"),
+        (["--resume", "--logdir", "nowhere"], "logdir='nowhere': holds no checkpoint"),
+        (["--logdir", "."], "logdir='.': exists"),
+        (["--logdir", "file/run"], "logdir='file/run': is not writable"),
+    ],
+)
+def test_bad_input_is_one_line_and_code_2(experiment, capsys, flags, message):
+    pathlib.Path("file").touch()
+    assert experiment(*flags) == 2
+    output = capsys.readouterr()
+    assert output.err.startswith(f"error: {message}")
+    assert output.err.count("\n") == 1
+    assert not output.out
+    assert [path.name for path in pathlib.Path().iterdir()] == ["file"]
+
+
+@pytest.mark.parametrize(
+    ("flags", "hint"),
+    [
+        (["--env-step", "5"], "--env-steps"),
+        (["--value-alignment.wieght", "off"], "--value-alignment.weight"),
+        (["--seed", "x"], "--seed"),
+        (["--value-alignment.weight", "of"], "adaptive"),
+    ],
+)
+def test_a_typo_is_refused_with_a_suggestion(experiment, capsys, flags, hint):
+    with pytest.raises(SystemExit, match="2"):
+        experiment(*flags)
+    assert hint in capsys.readouterr().err
+    assert not list(pathlib.Path().iterdir())
+
+
+def test_the_preset_says_what_it_is(experiment, capsys):
+    assert experiment() == 0
+    text = capsys.readouterr().out
+    assert "preset quick: cartpole_swingup, 30,000 env steps, size 1m" in text
+    assert "not the paper's setting" in text
+    assert "after 3,000 env steps, a warm-up scaled" in text
+    assert "--preset paper" in text
+    assert experiment("--preset", "paper", "--value-alignment.weight", "off") == 0
+    assert "value alignment: off" in capsys.readouterr().out
+
+
+def test_resume_takes_the_settings_of_the_saved_run(saved):
+    logdir, config = saved
+    arguments = parse("--resume", "--logdir", str(logdir), "--env-steps", "1000")
+    assert arguments.resume
+    assert arguments.config == tiny.config(
+        task="walker_run", preset="quick", size="1m", seed=7, env_steps=1000
+    )
+    assert parse("--resume", "--logdir", str(logdir), "--preset", "quick").config == config
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--size", "12m"], "size='12m': the checkpoint was trained with '1m'"),
+        (["--task", "walker_walk"], "task='walker_walk': the checkpoint was"),
+        (["--preset", "paper"], "preset='paper': the checkpoint was"),
+        (["--world-model.stoch", "8"], "world_model.stoch=8: the checkpoint was"),
+        (["--env-steps", "40"], "env_steps=40: the checkpoint is at 48 already"),
+    ],
+)
+def test_resume_refuses_other_settings_by_name(experiment, saved, capsys, flags, message):
+    before = sorted(saved[0].rglob("*"))
+    assert experiment("--resume", "--logdir", str(saved[0]), *flags) == 2
+    assert message in capsys.readouterr().err
+    assert sorted(saved[0].rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (InvalidInput("a", 1, "b"), 2),
+        (runner.RunError("loss"), 1),
+        (checkpoint.SaveError("disk"), 1),
+        (KeyboardInterrupt(), 130),
+    ],
+)
+def test_what_goes_wrong_is_one_line(capsys, error, code):
+    def fail():
+        raise error
+
+    assert command_line.guard(fail) == code
+    assert capsys.readouterr().err.count("\n") == 1

@@ -1,0 +1,122 @@
+"""Scores: whole episodes, each counted once, and raw actions in the actuator's range."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import tiny
+
+from vawm import checkpoint, evaluate, policy, train
+from vawm.agent import make_agent
+from vawm.envs import probes
+from vawm.errors import InvalidInput
+from vawm.evaluate import Score
+from vawm.policy import Policy
+from vawm.types import EnvSpec
+
+CARTPOLE = EnvSpec("cartpole_balance", (5,), "float32", 1, False, 2, 5, 200)
+
+
+def scripted(spec, action):
+    """A policy that always does the same."""
+    return Policy(
+        config=tiny.CONFIG,
+        spec=spec,
+        env_steps=0,
+        params=None,
+        initial=lambda n: jnp.zeros(n),
+        act=lambda key, carry, timestep: (carry, jnp.full((carry.shape[0], 1), action)),
+    )
+
+
+def test_a_score_has_mean_and_standard_error():
+    score = Score((1.0, 2.0, 6.0))
+    assert score.mean == 3.0
+    assert score.standard_error == pytest.approx(math.sqrt(7 / 3))
+    assert str(score) == "3.0 +- 1.5 over 3 episodes"
+    assert math.isnan(Score((1.0,)).standard_error)
+
+
+@pytest.mark.parametrize(("action", "expected"), [(0.5, 4.0), (0.0, 0.0), (9.0, 0.0)])
+def test_only_the_first_episode_of_each_environment_counts(action, expected):
+    env = probes.make("action_reward", num_envs=3)
+    score = evaluate.evaluate(scripted(env.spec, action), episodes=3, env=env)
+    np.testing.assert_allclose(score.returns, [expected] * 3)
+
+
+def test_the_seed_decides():
+    env = probes.make("observation_reward", num_envs=4)
+    returns = [
+        evaluate.evaluate(scripted(env.spec, 0.0), episodes=4, seed=seed, env=env).returns
+        for seed in (0, 0, 1)
+    ]
+    assert returns[0] == returns[1] != returns[2]
+
+
+def test_no_episodes_are_refused():
+    with pytest.raises(InvalidInput, match="episodes=0: use a number of at least 1"):
+        evaluate.evaluate(scripted(CARTPOLE, 0.0), episodes=0)
+
+
+def test_actions_are_clipped_and_stretched_to_the_actuators():
+    low, high = np.array([-2.0, 0.0]), np.array([2.0, 1.0])
+    raw = np.array([[-3.0, -1.0], [0.0, 0.5], [1.0, 7.0]])
+    np.testing.assert_allclose(
+        evaluate.to_actuator(raw, low, high), [[-2.0, 0.0], [0.0, 0.75], [2.0, 1.0]]
+    )
+
+
+def test_the_same_policy_plays_in_the_simulation_of_dm_control():
+    """Still, a cartpole that starts upright falls within seconds: a middling return."""
+    still = evaluate.evaluate(scripted(CARTPOLE, 0.0), episodes=2, physics="mujoco")
+    assert all(100 < total < 900 for total in still.returns)
+    again = evaluate.evaluate(scripted(CARTPOLE, 0.0), episodes=2, physics="mujoco")
+    assert again == still
+    pushed = evaluate.evaluate(scripted(CARTPOLE, 5.0), episodes=2, physics="mujoco")
+    assert pushed.mean < still.mean
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory):
+    """A folder with an untrained checkpoint, and its parameters."""
+    logdir = tmp_path_factory.mktemp("saved")
+    env = tiny.env()
+    agent = make_agent(tiny.CONFIG, env.spec)
+    state = jax.jit(lambda key: train.init(env, agent, tiny.CONFIG, key))(jax.random.key(3))
+    checkpoint.save(logdir, state, env_steps=0, config=tiny.CONFIG, spec=env.spec, progress={})
+    return logdir, state.learner.params
+
+
+def test_a_loaded_policy_acts_like_the_agent_that_was_saved(saved):
+    logdir, params = saved
+    env = tiny.env()
+    loaded = policy.load(logdir)
+    agent = make_agent(tiny.CONFIG, env.spec)
+    _, timestep = env.reset(jax.random.key(0))
+    carry, action = loaded.act(jax.random.key(1), loaded.initial(2), timestep)
+    expected = jax.jit(agent.act)(params, jax.random.key(1), agent.initial(2), timestep)
+    jax.tree.map(np.testing.assert_array_equal, (carry, action), expected)
+    assert (loaded.config, loaded.spec, loaded.env_steps) == (tiny.CONFIG, env.spec, 0)
+
+
+def test_the_command_line_reports_each_simulation(saved, monkeypatch, capsys):
+    asked = []
+
+    def fake(_, **kwargs):
+        asked.append(kwargs)
+        return Score((1.0, 3.0))
+
+    monkeypatch.setattr(evaluate, "evaluate", fake)
+    monkeypatch.setattr(evaluate.cache, "enable", lambda: None)
+    arguments = ["--logdir", str(saved[0]), "--episodes", "2", "--physics", "mujoco"]
+    assert evaluate.main(arguments) == 0
+    assert [kwargs["physics"] for kwargs in asked] == ["mjx", "mujoco"]
+    assert capsys.readouterr().out.count("2.0 +- 1.0 over 2 episodes") == 2
+
+
+def test_an_empty_folder_is_one_line_and_code_2(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(evaluate.cache, "enable", lambda: None)
+    assert evaluate.guard(lambda: evaluate.main(["--logdir", str(tmp_path)])) == 2
+    assert capsys.readouterr().err.startswith("error: logdir=")

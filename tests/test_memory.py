@@ -1,0 +1,74 @@
+"""The estimate before anything is allocated."""
+
+import jax
+import jax.numpy as jnp
+import pytest
+import tiny
+
+from vawm import memory, train
+from vawm.agent import make_agent
+from vawm.errors import InvalidInput
+from vawm.memory import Estimate
+
+NEEDED = Estimate(
+    replay=1000 * 2**20,
+    replay_capacity=1000,
+    params=100 * 2**20,
+    optimizer=200 * 2**20,
+    other_state=0,
+    working=700 * 2**20,
+)
+
+
+def test_the_state_is_counted_exactly():
+    env = tiny.env()
+    agent = make_agent(tiny.CONFIG, env.spec)
+    state = jax.eval_shape(lambda k: train.init(env, agent, tiny.CONFIG, k), jax.random.key(0))
+    needed = memory.estimate(state, tiny.CONFIG)
+    total = needed.replay + needed.params + needed.optimizer + needed.other_state
+    assert total == memory.nbytes(state)
+    assert needed.params == memory.nbytes(jax.eval_shape(agent.init, jax.random.key(0)))
+    assert needed.replay_capacity == tiny.CONFIG.replay.capacity
+
+
+def test_keys_and_small_types_are_counted_in_bytes():
+    tree = (
+        jax.random.split(jax.random.key(0), 3),
+        jnp.zeros(5, jnp.bfloat16),
+        jnp.zeros((2, 0)),
+    )
+    assert memory.nbytes(tree) == 3 * 8 + 5 * 2
+
+
+def test_what_fits_is_accepted():
+    memory.check(NEEDED, NEEDED.total)
+    memory.check(NEEDED, None)
+
+
+def test_what_does_not_fit_is_refused_with_the_largest_replay_that_would():
+    with pytest.raises(InvalidInput) as error:
+        memory.check(NEEDED, 1500 * 2**20)
+    assert str(error.value).startswith(
+        "replay.capacity=1000: needs 1.95 GiB, 1.46 GiB are free"
+    )
+    assert str(error.value).endswith("use replay.capacity=500 at most")
+
+
+def test_a_model_that_does_not_fit_alone_is_not_blamed_on_replay():
+    with pytest.raises(InvalidInput, match="use a smaller size or batch"):
+        memory.check(NEEDED, 900 * 2**20)
+
+
+def test_free_memory_is_known_here():
+    assert memory.available_bytes() is None or memory.available_bytes() > 0
+
+
+def test_a_control_group_lowers_what_is_free(tmp_path, monkeypatch):
+    maximum, usage, stat = (tmp_path / name for name in ("max", "current", "stat"))
+    maximum.write_text("1000000\n")
+    usage.write_text("600000\n")
+    stat.write_text("inactive_file 1000\nactive_file 500\n")
+    monkeypatch.setattr(memory, "CGROUP_LIMITS", [(str(maximum), str(usage), str(stat))])
+    assert memory._available_on_host() == 1000000 - 600000 + 1500
+    maximum.write_text("max\n")
+    assert memory._available_on_host() != 401500

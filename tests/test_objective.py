@@ -1,0 +1,189 @@
+"""Where gradients go, and that value alignment is wired as the paper says."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import tiny
+from test_nets import noisy
+
+from vawm import objective
+from vawm.agent import make_agent
+from vawm.config import ValueAlignmentConfig
+from vawm.types import Inference, Latent, Trajectory
+
+SPEC = tiny.env().spec
+BATCH, LENGTH = 2, 8
+ON = ValueAlignmentConfig(weight="static", static_weight=1.0, warmup_steps=0)
+STOPPED = dataclasses.replace(ON, deter_gradient="stop")
+SLOW = dataclasses.replace(ON, critic="slow")
+OTHER_HEADS = "decoder", "reward", "cont"
+
+
+def make(alignment=ON, **critic):
+    config = dataclasses.replace(
+        tiny.CONFIG,
+        value_alignment=alignment,
+        critic=dataclasses.replace(tiny.CONFIG.critic, **critic),
+    )
+    return make_agent(config, SPEC), config
+
+
+def batch(agent):
+    keys = jax.random.split(jax.random.key(7), 3)
+    shape = BATCH, LENGTH + 1
+    flags = jnp.zeros(shape, bool)
+    trajectory = Trajectory(
+        obs=jax.random.normal(keys[0], (*shape, 2)),
+        reward=jax.random.normal(keys[1], shape),
+        is_first=flags.at[0, 5].set(True),
+        is_last=flags.at[0, 4].set(True),
+        is_terminal=flags,
+        action=jax.random.normal(keys[2], (*shape, 1)),
+    )
+    return objective.Batch(trajectory, agent.world_model.initial(BATCH))
+
+
+@functools.cache
+def alignment_gradient(alignment):
+    """A compiled function of parameters: L_var, and the gradient of its mean alone."""
+    agent, config = make(alignment)
+    value_alignment = objective.make_value_alignment(agent, config)
+
+    def loss(params):
+        data = batch(agent)
+        steps = jax.tree.map(lambda x: x[:, 1:], data.trajectory)
+        _, inference = agent.world_model.observe(
+            params.world_model,
+            jax.random.key(1),
+            data.context,
+            steps.obs,
+            data.trajectory.action[:, :-1],
+            steps.is_first,
+            train=True,
+        )
+        kl = jnp.ones((BATCH, LENGTH))
+        aligned, weight = value_alignment(params.critic, inference, kl, jnp.asarray(1))
+        return jnp.mean(aligned * weight), aligned
+
+    return jax.jit(jax.grad(loss, has_aux=True))
+
+
+@functools.cache
+def params(zero_critic=False):
+    agent, _ = make()
+    return (lambda x: x if zero_critic else noisy(x))(jax.jit(agent.init)(jax.random.key(0)))
+
+
+def norm(tree):
+    return float(sum(jnp.sum(jnp.abs(x)) for x in jax.tree.leaves(tree)))
+
+
+def test_value_alignment_trains_the_latent_dynamics_and_nothing_else():
+    gradient, aligned = alignment_gradient(ON)(params())
+    assert (aligned > 0).any()
+    model = gradient.world_model
+    assert norm(gradient.critic) == 0.0
+    assert norm(gradient.actor) == 0.0
+    for head in OTHER_HEADS:
+        assert norm(model[head]) == 0.0
+    assert norm(model["encoder"]) > 0
+    for part in ("gru", "prior_net", "posterior_out"):
+        assert norm(model["rssm"][part]) > 0, part
+
+
+def test_with_h_stopped_only_samples_carry_its_gradient():
+    live = alignment_gradient(ON)(params())[0].world_model["rssm"]
+    gradient = alignment_gradient(STOPPED)(params())[0].world_model["rssm"]
+    assert 0 < norm(gradient["gru"]) < norm(live["gru"])
+    assert norm(gradient["prior_net"]) > 0
+
+
+def test_without_the_second_term_the_posterior_learns_only_through_later_states():
+    """Eq. 4 as printed, h stopped: the last posterior of a sequence has no way to matter."""
+    printed = dataclasses.replace(STOPPED, representation_scale=0.0)
+    both = alignment_gradient(STOPPED)(params())[0].world_model["rssm"]
+    first = alignment_gradient(printed)(params())[0].world_model["rssm"]
+    assert norm(first["posterior_out"]) < norm(both["posterior_out"])
+    assert norm(first["prior_net"]) == pytest.approx(norm(both["prior_net"]), rel=1e-5)
+
+
+def test_a_critic_that_starts_at_zero_gives_exactly_no_loss_and_no_gradient():
+    gradient, aligned = alignment_gradient(ON)(params(zero_critic=True))
+    np.testing.assert_array_equal(aligned, 0.0)
+    assert norm(gradient) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("alignment", "step", "expected"),
+    [
+        (ValueAlignmentConfig(), 10_000, 0.0),
+        (ValueAlignmentConfig(), 10_001, 1 / 3),
+        (ValueAlignmentConfig(weight="static", static_weight=0.5), 10_000, 0.0),
+        (ValueAlignmentConfig(weight="static", static_weight=0.5), 10_001, 0.5),
+        (ValueAlignmentConfig(weight="off"), 10_001, 0.0),
+    ],
+)
+def test_the_weight_is_gated_by_the_warmup_and_follows_its_mode(alignment, step, expected):
+    agent, config = make(alignment)
+    shape = BATCH, LENGTH
+    deter, index = jnp.ones((*shape, 32)), jnp.zeros((*shape, 4), int)
+    latents = [Latent(deter, jax.nn.one_hot(index + k, 4)) for k in (0, 1)]
+    logits = jnp.zeros((*shape, 4, 4))
+    inference = Inference(*latents, logits, logits, jnp.ones(shape, bool).at[0, 0].set(False))
+    value_alignment = jax.jit(objective.make_value_alignment(agent, config))
+    aligned, weight = value_alignment(
+        params().critic, inference, jnp.full(shape, 3.0), jnp.asarray(step)
+    )
+    assert weight[0, 0] == aligned[0, 0] == 0.0  # a state that nothing predicted
+    np.testing.assert_allclose(weight[1], expected, rtol=1e-6)
+    assert (aligned[1] > 0).all()  # logged whether or not it is used
+
+
+@functools.cache
+def full_gradients(alignment, **critic):
+    """Gradients of the world model's and of the behaviour's loss, each alone."""
+    agent, config = make(alignment, **critic)
+    model_loss = objective.make_world_model_loss(agent, config)
+    behaviour_loss = objective.make_behaviour_loss(agent, config)
+
+    def losses(params, slow):
+        data = batch(agent)
+        keys = jax.random.split(jax.random.key(1))
+        first, inference, metrics = model_loss(params, slow, data, keys[0], jnp.asarray(1))
+        scale = objective.returns.init_return_scale()
+        second, _, more = behaviour_loss(params, slow, scale, data, inference, keys[1])
+        return jnp.stack([first, second]), metrics | more
+
+    slow = jax.tree.map(lambda x: x + 0.01, params().critic)
+    jacobian, metrics = jax.jit(jax.jacrev(losses, has_aux=True))(params(), slow)
+    return (*(jax.tree.map(lambda x, i=i: x[i], jacobian) for i in (0, 1)), metrics)
+
+
+def test_each_loss_trains_what_it_should():
+    model, behaviour, metrics = full_gradients(ON, replay_gradient=True)
+    assert norm(model.actor) == norm(model.critic) == 0.0
+    for name, part in model.world_model.items():
+        assert norm(part) > 0, name
+    assert norm(behaviour.actor) > 0
+    assert norm(behaviour.critic) > 0
+    # The replay value loss is the only way from behaviour into the world model.
+    assert norm(behaviour.world_model["encoder"]) > 0
+    for head in OTHER_HEADS:
+        assert norm(behaviour.world_model[head]) == 0.0
+    assert all(np.isfinite(value) for value in metrics.values())
+
+
+def test_the_replay_value_loss_can_be_kept_out_of_the_world_model():
+    _, behaviour, _ = full_gradients(SLOW, replay_gradient=False)
+    assert norm(behaviour.world_model) == 0.0
+    assert norm(behaviour.critic) > 0
+
+
+def test_alignment_can_read_the_slow_critic():
+    online = full_gradients(ON, replay_gradient=True)[2]["value_alignment/loss"]
+    slow = full_gradients(SLOW, replay_gradient=False)[2]["value_alignment/loss"]
+    assert online != slow

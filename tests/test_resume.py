@@ -1,0 +1,81 @@
+"""Continuing a run: what may differ, and a replay that grows."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import tiny
+import toy
+
+from vawm import checkpoint, replay, resume
+from vawm.errors import InvalidInput
+from vawm.types import Latent, Trajectory
+
+
+def steps(start, count, num_envs=2):
+    """Trajectory and latent whose numbers are their times."""
+    time = jnp.broadcast_to(jnp.arange(start, start + count), (num_envs, count))
+    flag = jnp.zeros((num_envs, count), bool)
+    value = time.astype(jnp.float32)
+    trajectory = Trajectory(value[..., None], value, flag, flag, flag, value[..., None])
+    stoch = jax.nn.one_hot(time[..., None] % 4, 4)
+    return trajectory, Latent(value[..., None], stoch)
+
+
+def filled(count, capacity):
+    example = jax.tree.map(lambda x: x[:, 0], steps(0, 1))
+    buffer = replay.init(*example, capacity=capacity)
+    for start in range(0, count, 2):
+        buffer = replay.add(buffer, *steps(start, 2))
+    return buffer
+
+
+@pytest.mark.parametrize("count", [0, 4, 6])
+def test_a_replay_that_has_not_wrapped_grows_into_the_larger_one(count):
+    toy.assert_equal(resume.grow(filled(count, 6), 10), filled(count, 10))
+
+
+def test_a_replay_that_has_wrapped_keeps_its_steps_in_order():
+    grown = resume.grow(filled(8, 6), 10)
+    np.testing.assert_array_equal(grown.trajectory.reward[0, :6], np.arange(2, 8))
+    assert (int(grown.head), int(grown.size)) == (6, 6)
+    np.testing.assert_array_equal(
+        replay.add(grown, *steps(8, 2)).trajectory.reward[0, :8], np.arange(2, 10)
+    )
+
+
+@pytest.fixture
+def saved(tmp_path):
+    checkpoint.save(
+        tmp_path, toy.state(), env_steps=48, config=tiny.CONFIG, spec=toy.SPEC, progress={}
+    )
+    return tmp_path
+
+
+def test_a_run_may_be_extended_and_logged_otherwise(saved):
+    resume.check(saved, tiny.config(env_steps=10_000, log_every=3, save_every=5))
+
+
+@pytest.mark.parametrize(
+    ("changes", "field"),
+    [
+        ({"task": "walker_walk"}, "task"),
+        ({"size": "12m"}, "size"),
+        ({"seed": 1}, "seed"),
+        (
+            {"value_alignment": dataclasses.replace(tiny.CONFIG.value_alignment, weight="off")},
+            "value_alignment.weight",
+        ),
+    ],
+)
+def test_another_choice_is_refused_by_name(saved, changes, field):
+    with pytest.raises(InvalidInput, match="the checkpoint was trained with") as error:
+        resume.check(saved, tiny.config(**changes))
+    assert error.value.field == field
+
+
+def test_a_finished_run_is_not_continued(saved):
+    with pytest.raises(InvalidInput, match="env_steps=48: the checkpoint is at 48 already"):
+        resume.check(saved, tiny.config(env_steps=48))

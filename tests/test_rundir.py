@@ -1,0 +1,67 @@
+"""A run's folder: new, writable, and used by one process."""
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+import tiny
+
+from vawm import manifest, rundir
+from vawm.errors import InvalidInput
+
+
+def test_a_new_or_empty_folder_is_accepted_and_not_made(tmp_path):
+    rundir.check_new(tmp_path)
+    rundir.check_new(tmp_path / "a" / "b")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_holds_something_is_refused(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(InvalidInput, match="exists; continue that run with --resume"):
+        rundir.check_new(tmp_path)
+
+
+@pytest.mark.parametrize("below", [".", "a", "a/b"])
+def test_a_path_through_a_file_is_refused(tmp_path, below):
+    (tmp_path / "file").touch()
+    with pytest.raises(InvalidInput, match="is not writable"):
+        rundir.check_new(tmp_path / "file" / below)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_folder_without_permission_is_refused(tmp_path):
+    tmp_path.chmod(0o500)
+    with pytest.raises(InvalidInput, match="is not writable"):
+        rundir.check_new(tmp_path / "run")
+
+
+def test_a_second_claim_is_refused_and_names_the_holder(tmp_path):
+    with (
+        rundir.claim(tmp_path),
+        pytest.raises(InvalidInput, match=f"in use by process {os.getpid()} on "),
+        rundir.claim(tmp_path),
+    ):
+        pass
+    with rundir.claim(tmp_path):
+        pass
+
+
+def test_the_lock_of_a_killed_process_is_free(tmp_path):
+    script = (
+        "import os, pathlib, sys; from vawm import rundir\n"
+        "with rundir.claim(pathlib.Path(sys.argv[1])): os.kill(os.getpid(), 9)"
+    )
+    ended = subprocess.run([sys.executable, "-c", script, tmp_path], check=False)
+    assert ended.returncode == -9
+    with rundir.claim(tmp_path):
+        pass
+
+
+def test_the_config_is_written_with_the_version(tmp_path):
+    rundir.write_config(tmp_path, tiny.CONFIG)
+    content = json.loads((tmp_path / "config.json").read_text())
+    assert content["vawm"] == manifest.version()
+    assert manifest.config_from_dict(content["config"]) == tiny.CONFIG

@@ -1,0 +1,197 @@
+"""The host loop: lines, checkpoints, signals, and resuming bit for bit."""
+
+import io
+import json
+import math
+import os
+import signal
+
+import jax
+import jax.numpy as jnp
+import pytest
+import rich.console
+import tiny
+import toy
+
+from vawm import checkpoint, envs, memory, runner, tracking
+from vawm.envs import Environment
+from vawm.errors import InvalidInput
+
+WALL_TIME = ("time", "env_steps_per_s", "updates_per_s")
+
+
+class SignalAt(io.StringIO):
+    """A console's file that sends SIGINT when it reads `text`."""
+
+    def __init__(self, text):
+        super().__init__()
+        self._text = text
+
+    def write(self, text):
+        if self._text in text:
+            os.kill(os.getpid(), signal.SIGINT)
+        return super().write(text)
+
+
+class FakeStep:
+    """8 env steps and one update per chunk; `loss(env_steps)` is what it reports."""
+
+    def __init__(self, loss):
+        self._loss = loss
+
+    def lower(self, _):
+        return self
+
+    def compile(self):
+        return self
+
+    def __call__(self, state):
+        state = state._replace(env_steps=state.env_steps + 8)
+        loss = self._loss(int(state.env_steps))
+        return state, {
+            "env_steps": state.env_steps,
+            "updates": state.env_steps // 8,
+            "chunk/updates": jnp.int32(1),
+            "episode/count": jnp.int32(0),
+            "episode/return": jnp.float32(0),
+            "loss/critic": jnp.float32(loss),
+        }
+
+
+@pytest.fixture
+def fake(monkeypatch):
+    """Puts a `FakeStep` with the given losses in place of training."""
+
+    def install(loss=lambda env_steps: env_steps):
+        env = Environment(toy.SPEC, None, None)
+        start = runner.Start(env, lambda key: toy.state(), FakeStep(loss), None)
+        monkeypatch.setattr(runner, "prepare", lambda *_: start)
+
+    return install
+
+
+def quiet():
+    return rich.console.Console(file=io.StringIO())
+
+
+def run(config, logdir, **changes):
+    return runner.run(config, logdir, **{"env": tiny.env(), "console": quiet()} | changes)
+
+
+def lines(logdir):
+    return tracking.read(logdir / "metrics.jsonl")
+
+
+def measured(logdir):
+    return [
+        {name: value for name, value in line.items() if name not in WALL_TIME}
+        for line in lines(logdir)
+    ]
+
+
+def test_a_line_closes_each_interval_and_the_run(tmp_path, fake):
+    fake()
+    run(tiny.config(env_steps=56, log_every=24), tmp_path)
+    assert [line["env_steps"] for line in lines(tmp_path)] == [24, 48, 56]
+    assert [line["loss/critic"] for line in lines(tmp_path)] == [16.0, 40.0, 56.0]
+    assert [line["updates"] for line in lines(tmp_path)] == [3, 6, 7]
+    assert all(line["episode/return"] is None for line in lines(tmp_path))
+
+
+def test_a_run_leaves_its_config_a_checkpoint_and_advice(tmp_path, fake):
+    fake()
+    console = quiet()
+    result = run(tiny.CONFIG, tmp_path, console=console, command="python train.py")
+    assert result == runner.Result(tmp_path, 96, 0)
+    assert json.loads((tmp_path / "config.json").read_text())["config"]["env_steps"] == 96
+    assert checkpoint.latest(tmp_path).name == "000000000096"
+    assert f"python -m vawm.evaluate --logdir {tmp_path}" in console.file.getvalue()
+    assert f"python train.py --resume --logdir {tmp_path}" in console.file.getvalue()
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_checkpoint(
+    tmp_path, fake, value
+):
+    fake(lambda env_steps: value if env_steps > 40 else 1.0)
+    with pytest.raises(runner.RunError, match=r"loss/critic is .* at env_steps=48.* at 32"):
+        run(tiny.CONFIG, tmp_path)
+    assert checkpoint.latest(tmp_path).name == "000000000032"
+    assert lines(tmp_path)[-1]["loss/critic"] is None
+
+
+def test_running_out_of_memory_is_explained(tmp_path, fake):
+    def exhausted(_):
+        raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: out of memory\nlong trace")
+
+    fake(exhausted)
+    with pytest.raises(runner.RunError, match=r"smaller replay.capacity.*RESOURCE_EXHAUSTED"):
+        run(tiny.CONFIG, tmp_path)
+
+
+@pytest.mark.parametrize(
+    "changes", [{"env": None}, {"resume": True}, {"config": tiny.config(num_envs=0)}]
+)
+def test_bad_input_is_refused_with_nothing_written(tmp_path, changes):
+    with pytest.raises(InvalidInput):
+        run(**{"config": tiny.CONFIG, "logdir": tmp_path / "run"} | changes)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_run_that_does_not_fit_is_refused_with_nothing_written(tmp_path, monkeypatch):
+    monkeypatch.setattr(memory, "available_bytes", lambda: 1000)
+    with pytest.raises(InvalidInput, match=r"replay.capacity=64: needs .* are free"):
+        run(tiny.CONFIG, tmp_path / "run")
+    assert not list(tmp_path.iterdir())
+
+
+def test_every_task_can_be_named(tmp_path):
+    for task in envs.TASKS:
+        runner.check(tiny.config(task=task), tmp_path / "run", resume=False)
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(tmp_path_factory):
+    """A folder with a whole run of `tiny.CONFIG`, twice as long."""
+    logdir = tmp_path_factory.mktemp("uninterrupted")
+    run(tiny.config(env_steps=192), logdir)
+    return logdir
+
+
+def assert_same_run(actual, expected):
+    shapes = runner.prepare(tiny.config(env_steps=192), tiny.env()).shapes
+    restored = [checkpoint.restore(logdir, shapes) for logdir in (actual, expected)]
+    toy.assert_equal(restored[0][0], restored[1][0])
+    assert [saved.env_steps for _, saved in restored] == [192, 192]
+    assert measured(actual) == measured(expected)
+
+
+def test_a_line_reports_what_was_promised(uninterrupted):
+    last = lines(uninterrupted)[-1]
+    names = ["env_steps", "updates", "time", "env_steps_per_s", "updates_per_s", "latent/kl"]
+    names += ["episode/return", "episode/length", "episode/count", "env/nonfinite"]
+    names += ["value_alignment/weight", "value_alignment/loss", "loss/total"]
+    assert all(math.isfinite(last[name]) for name in names)
+    assert last["episode/length"] == 4
+
+
+@pytest.mark.parametrize("env_steps", [96, 104])
+def test_k_steps_and_the_rest_equal_a_run_in_one_piece(tmp_path, uninterrupted, env_steps):
+    """104 is not a multiple of `log_every`: its last line is written and dropped again."""
+    run(tiny.config(env_steps=env_steps), tmp_path)
+    run(tiny.config(env_steps=192), tmp_path, resume=True)
+    assert_same_run(tmp_path, uninterrupted)
+
+
+def test_a_run_that_a_signal_stopped_goes_on_as_if_nothing_had_happened(
+    tmp_path, uninterrupted
+):
+    console = rich.console.Console(file=SignalAt("env_steps 84/"), width=200)
+    result = run(tiny.config(env_steps=192), tmp_path, console=console)
+    assert result.exit_code == 130
+    assert 84 <= result.env_steps < 192
+    assert "resume with: the same command --resume" in console.file.getvalue()
+    with (tmp_path / "metrics.jsonl").open("a") as file:
+        file.write('{"env_steps": 10000}\n{"half a line')
+    run(tiny.config(env_steps=192), tmp_path, resume=True)
+    assert_same_run(tmp_path, uninterrupted)

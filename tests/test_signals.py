@@ -1,0 +1,62 @@
+"""The first signal asks, the second ends, even inside a long call."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+
+import pytest
+
+from vawm import signals
+
+SCRIPT = """
+import ctypes, sys
+from vawm import signals
+with signals.catch(lambda: print("asked", flush=True)) as stop:
+    print("ready", flush=True)
+    libc = ctypes.CDLL(None)
+    for _ in range(600):  # a call of compiled code that signals do not end
+        libc.usleep(100_000)
+        if sys.argv[1] == "once" and stop.signal:
+            break
+sys.exit(stop.exit_code)
+"""
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize("times", ["once", "twice"])
+def test_signals_end_a_process_with_the_code_that_shells_expect(number, code, times):
+    process = subprocess.Popen(
+        [sys.executable, "-c", SCRIPT, times], stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout.readline() == "ready\n"
+    process.send_signal(number)
+    assert process.stdout.readline() == "asked\n"
+    if times == "twice":
+        process.send_signal(number)
+    assert process.wait(timeout=30) == code
+    process.stdout.close()
+
+
+def test_the_handlers_of_before_come_back():
+    before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+    heard = threading.Event()
+    with signals.catch(heard.set) as stop:
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert heard.wait(10)
+        assert stop.signal == signal.SIGTERM
+    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
+    assert stop.exit_code == 143
+
+
+def test_outside_the_main_thread_nothing_is_caught():
+    def work():
+        with signals.catch() as stop:
+            codes.append(stop.exit_code)
+
+    codes = []
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert codes == [0]

@@ -1,0 +1,89 @@
+"""Lines of metrics: means, counts, strictly valid JSON."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from vawm import tracking
+from vawm.tracking import Interval
+
+
+def chunk(updates, loss, *, episodes=0, returns=0.0):
+    return {
+        "env_steps": np.int32(100),
+        "updates": np.int32(50),
+        "chunk/updates": np.int32(updates),
+        "episode/count": np.int32(episodes),
+        "episode/return": np.float32(returns),
+        "episode/length": np.int32(10 * episodes),
+        "env/nonfinite": np.int32(1),
+        "loss/critic": np.float32(loss),
+    }
+
+
+def closed(interval):
+    return tracking.line(interval, env_steps=100, updates=50, seconds=12.0)
+
+
+def add_all(*chunks):
+    interval = Interval()
+    for metrics in chunks:
+        interval = tracking.add(interval, metrics, env_steps=8, seconds=0.5)
+    return interval
+
+
+def test_a_line_weighs_each_chunk_by_its_updates():
+    line = closed(add_all(chunk(1, 5.0), chunk(3, 1.0), chunk(0, math.nan)))
+    assert line["loss/critic"] == (1 * 5.0 + 3 * 1.0) / 4
+    assert line["updates_per_s"] == pytest.approx(4 / 1.5, abs=1e-3)
+    assert line["env_steps_per_s"] == 16.0
+    assert (line["env_steps"], line["updates"], line["time"]) == (100, 50, 12.0)
+
+
+def test_episode_metrics_are_means_over_finished_episodes():
+    line = closed(add_all(chunk(1, 0, episodes=1, returns=10), chunk(1, 0, episodes=3)))
+    assert line["episode/count"] == 4
+    assert line["episode/return"] == 10 / 4
+    assert line["episode/length"] == 10
+    assert line["env/nonfinite"] == 2
+
+
+def test_what_did_not_happen_is_null():
+    line = closed(add_all(chunk(0, math.nan)))
+    assert line["episode/return"] is None
+    assert line["loss/critic"] is None
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_a_line_is_strictly_valid_json(value):
+    def refuse(constant):
+        raise AssertionError(constant)
+
+    text = tracking.as_json(closed(add_all(chunk(1, value))))
+    assert json.loads(text, parse_constant=refuse)["loss/critic"] is None
+
+
+def test_an_interval_survives_json_exactly():
+    interval = add_all(chunk(1, 0.1), chunk(3, 1 / 3, episodes=2, returns=0.7))
+    assert Interval(**json.loads(json.dumps(interval._asdict()))) == interval
+
+
+def test_truncation_drops_later_lines_and_half_a_line(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    path.write_text('{"env_steps": 1}\n{"env_steps": 2}\n{"env_steps": 3}\n{"env_st')
+    tracking.truncate(path, 2)
+    assert path.read_text() == '{"env_steps": 1}\n{"env_steps": 2}\n'
+
+
+def test_truncation_of_nothing_is_nothing(tmp_path):
+    tracking.truncate(tmp_path / "metrics.jsonl", 2)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_tracker_writes_lines_and_tensorboard_events(tmp_path):
+    with tracking.Tracker(tmp_path) as tracker:
+        tracker.write(closed(add_all(chunk(1, 2.0))))
+        assert tracking.read(tmp_path / "metrics.jsonl")[0]["loss/critic"] == 2.0
+    assert list(tmp_path.glob("events.out.tfevents.*"))

@@ -1,0 +1,200 @@
+"""The training step: counting, determinism, donation, vmapping."""
+
+import dataclasses
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import tiny
+
+from vawm import envs, train
+from vawm.agent import make_agent
+from vawm.envs import probes
+
+
+def make(config=tiny.CONFIG, env=None):
+    env = env or tiny.env()
+    agent = make_agent(config, env.spec)
+    return (
+        lambda key: train.init(env, agent, config, key),
+        train.make_train_step(env, agent, config),
+    )
+
+
+@pytest.fixture(scope="module")
+def compiled():
+    """`init` and `train_step` of the tiny configuration, compiled once for this module."""
+    init, step = make()
+    return jax.jit(init), jax.jit(step)
+
+
+def roll(step, state, count):
+    history = []
+    for _ in range(count):
+        state, metrics = step(state)
+        history.append({name: float(value) for name, value in metrics.items()})
+    return state, history
+
+
+def test_the_number_of_updates_follows_the_train_ratio_exactly(compiled):
+    init, step = compiled
+    _, history = roll(step, init(jax.random.key(0)), 20)
+    config = tiny.CONFIG
+    per_chunk = config.collect_steps * config.num_envs
+    batch = config.replay.batch_size * config.replay.batch_length
+    # 2 streams of 4 steps a chunk: with runs of 9 steps, 16 starts exist after 16 steps.
+    ready = [chunk for chunk in range(1, 21) if 2 * (4 * chunk - 8) >= batch]
+    expected = [
+        max(0, chunk - ready[0] + 1) * per_chunk * config.train_ratio // batch
+        for chunk in range(1, 21)
+    ]
+    assert [h["updates"] for h in history] == expected
+    assert [h["chunk/updates"] for h in history] == list(np.diff(expected, prepend=0))
+    assert expected[-1] > 10
+
+
+def test_a_fractional_ratio_carries_its_remainder_over():
+    config = dataclasses.replace(tiny.CONFIG, train_ratio=3)  # 1.5 updates a chunk
+    init, step = make(config)
+    _, history = roll(jax.jit(step), jax.jit(init)(jax.random.key(0)), 10)
+    done = [h["chunk/updates"] for h in history][4:]
+    assert done == [2, 1, 2, 1, 2, 1]
+
+
+def test_env_steps_leave_resets_out(compiled):
+    init, step = compiled
+    # Episodes of 4 steps: every fifth call is a reset.
+    _, history = roll(step, init(jax.random.key(0)), 10)
+    calls = np.arange(1, 11) * tiny.CONFIG.collect_steps
+    np.testing.assert_array_equal([h["env_steps"] for h in history], 2 * (calls - calls // 5))
+    assert sum(h["episode/count"] for h in history) == 2 * (40 // 5)
+    assert sum(h["episode/length"] for h in history) == 4 * 2 * (40 // 5)
+    assert sum(h["env/nonfinite"] for h in history) == 0
+
+
+def test_metrics_of_updates_are_nan_without_an_update_and_finite_with_one(compiled):
+    init, step = compiled
+    _, history = roll(step, init(jax.random.key(0)), 8)
+    assert np.isnan(history[0]["loss/total"])
+    assert all(np.isfinite(value) for value in history[-1].values())
+    assert {"value_alignment/loss", "value_alignment/weight", "latent/kl"} <= set(history[0])
+
+
+def test_value_alignment_starts_after_its_warmup(compiled):
+    init, step = compiled
+    _, history = roll(step, init(jax.random.key(0)), 10)
+    for line in history:
+        if line["chunk/updates"]:
+            active = line["env_steps"] > tiny.CONFIG.value_alignment.warmup_steps
+            assert (line["value_alignment/weight"] > 0) == active
+            assert (line["loss/value_alignment"] > 0) == active
+
+
+def test_the_step_is_deterministic_and_seeds_differ(compiled):
+    init, step = compiled
+    first, history = roll(step, init(jax.random.key(0)), 6)
+    again, _ = roll(step, init(jax.random.key(0)), 6)
+    chex.assert_trees_all_equal(first, again)
+    _, other = roll(step, init(jax.random.key(1)), 6)
+    assert history[-1]["loss/total"] != other[-1]["loss/total"]
+
+
+def test_the_step_is_traced_once_and_takes_its_state_by_donation():
+    init, step = make()
+    step = jax.jit(chex.assert_max_traces(step, n=1), donate_argnums=0)
+    first = jax.jit(init)(jax.random.key(0))
+    replayed = first.replay.trajectory.obs
+    state, _ = roll(step, first, 8)
+    assert replayed.is_deleted()
+    assert int(state.learner.step) > 0
+
+
+def test_two_seeds_vmapped_equal_the_two_runs_alone(compiled):
+    init, step = compiled
+    keys = jax.random.split(jax.random.key(3), 2)
+    raw_init, raw_step = make()
+    together, _ = roll_many(jax.jit(jax.vmap(raw_step)), jax.jit(jax.vmap(raw_init))(keys), 7)
+    for seed in range(2):
+        alone, _ = roll(step, init(keys[seed]), 7)
+        one = jax.tree.map(lambda x, seed=seed: x[seed], together)
+        np.testing.assert_array_equal(one.learner.step, alone.learner.step)
+        # Batched products round differently; 4 updates stay within 1e-4.
+        chex.assert_trees_all_close(one.learner.params, alone.learner.params, atol=1e-4)
+        chex.assert_trees_all_close(one.replay.trajectory, alone.replay.trajectory, atol=1e-3)
+
+
+def roll_many(step, state, count):
+    for _ in range(count):
+        state, metrics = step(state)
+    return state, metrics
+
+
+def test_the_slow_critic_is_a_moving_average_of_the_critic(compiled):
+    init, step = compiled
+    before, _ = roll(step, init(jax.random.key(0)), 6)
+    after, history = step(before)
+    assert int(history["chunk/updates"]) == 1
+    rate = tiny.CONFIG.critic.slow_rate
+    expected = jax.tree.map(
+        lambda new, slow: rate * new + (1 - rate) * slow,
+        after.learner.params.critic,
+        before.learner.slow_critic,
+    )
+    chex.assert_trees_all_close(after.learner.slow_critic, expected, atol=1e-7)
+
+
+def test_the_first_update_has_learning_rate_zero(compiled):
+    init, step = compiled
+    start = init(jax.random.key(0))
+    state, history = roll(step, start, 4)
+    assert history[-1]["updates"] == 1
+    chex.assert_trees_all_equal(state.learner.params, start.learner.params)
+    state, _ = step(state)
+    changed = jax.tree.map(lambda a, b: (a != b).any(), state.learner, start.learner)
+    assert any(jax.tree.leaves(changed.params))
+
+
+def test_inferred_latents_are_written_back(compiled):
+    init, step = compiled
+    before, _ = roll(step, init(jax.random.key(0)), 6)
+    after, _ = step(before)
+    old, new = (np.asarray(s.replay.latent.deter) for s in (before, after))
+    added = range(24, 28)  # the seventh chunk of 4 steps, not yet wrapped
+    kept = np.delete(np.arange(24), [])
+    assert (new[:, added] != 0).any()
+    assert (old[:, kept] != new[:, kept]).any()
+
+
+def test_physics_that_fails_is_counted_and_never_stored():
+    def breaks(env):
+        def step(state, action):
+            """Every third call ends the episode early, as a non-finite state does."""
+            state, timestep = env.step(state, action)
+            failed = state.steps == 3
+            return state, timestep._replace(is_last=timestep.is_last | failed)
+
+        return env._replace(step=step)
+
+    env = breaks(probes.make("truncation", num_envs=2, episode_length=10))
+    init, _ = make(env=env)
+    agent = make_agent(tiny.CONFIG, env.spec)
+    state = init(jax.random.key(0))
+    collect = jax.jit(train.make_collect(env, agent, tiny.CONFIG))
+    _, buffer, metrics = collect(
+        state.learner.params, state.collector, state.replay, jax.random.key(1)
+    )
+    assert int(metrics["env/nonfinite"]) == 2
+    assert all(jnp.isfinite(x).all() for x in jax.tree.leaves(buffer.trajectory))
+
+
+def test_a_task_on_mjx_trains_in_the_same_step():
+    config = dataclasses.replace(tiny.CONFIG, task="pendulum_swingup", collect_steps=8)
+    env = envs.make("pendulum_swingup", num_envs=2, action_repeat=2)
+    init, step = make(config, env)
+    state, history = roll(jax.jit(step, donate_argnums=0), jax.jit(init)(jax.random.key(0)), 3)
+    assert history[-1]["env_steps"] == 3 * 8 * 2 * 2
+    assert history[-1]["updates"] > 0
+    assert all(np.isfinite(value) for value in history[-1].values())
+    assert int(state.replay.size) == 24

@@ -1,0 +1,82 @@
+"""Configs that cannot run are refused with field, value and remedy."""
+
+import dataclasses
+import math
+
+import pytest
+import tiny
+
+from vawm import config as config_lib
+from vawm import validate
+from vawm.errors import InvalidInput
+
+NUMBERS = [name for name, _, kind in validate.fields(tiny.CONFIG) if kind in (int, float)]
+
+
+def changed(name, value, config=tiny.CONFIG):
+    """`config` with the field of a dotted name replaced."""
+    head, _, rest = name.partition(".")
+    if rest:
+        value = changed(rest, value, getattr(config, head))
+    return dataclasses.replace(config, **{head: value})
+
+
+@pytest.mark.parametrize("preset", config_lib.PRESETS)
+@pytest.mark.parametrize("size", config_lib.SIZES)
+def test_every_preset_is_valid_at_every_size(preset, size):
+    validate.check(validate.preset(preset, size))
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+@pytest.mark.parametrize("value", [-1, math.nan, math.inf, True, "3"])
+def test_every_number_is_checked(name, value):
+    with pytest.raises(InvalidInput) as error:
+        validate.check(changed(name, value))
+    assert error.value.field == name
+    assert str(error.value).startswith(f"{name}={value!r}: ")
+    assert "\n" not in str(error.value)
+
+
+def test_every_rule_is_about_a_field():
+    assert set(validate.RULES) <= set(NUMBERS)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "remedy"),
+    [
+        ("env_steps", 0, "above 0"),
+        ("num_envs", 0, "above 0"),
+        ("env_steps", 1.5, "whole number"),
+        ("action_repeat", 3, "divisor of 1000"),
+        ("compute_dtype", "float23", "did you mean 'float32'"),
+        ("value_alignment.weight", "none", "use one of adaptive, static, off"),
+        ("world_model.deter", 30, "multiple of world_model.blocks=4"),
+        ("world_model.classes", 257, "from 2 to 256"),
+        ("critic.bins", 40, "odd number"),
+        ("critic.slow_rate", 1.5, "up to 1"),
+        ("imagination.lambda_", 1.01, "from 0 to 1"),
+        ("imagination.discount_horizon", 1.0, "above 1"),
+        ("imagination.return_scale_low", 0.95, "less than imagination.return_scale_high"),
+        ("actor.min_std", 2.0, "at most actor.max_std"),
+        ("replay.capacity", 31, "at least 32, or smaller batches than 2 x 8"),
+        ("env_steps", 31, "at least 32, what the first update needs"),
+        ("collect_steps", 33, "at most 32"),
+        ("seed", 2**32, "from 0 to 4294967295"),
+    ],
+)
+def test_bad_values_come_with_a_remedy(name, value, remedy):
+    with pytest.raises(InvalidInput, match=remedy) as error:
+        validate.check(changed(name, value))
+    assert error.value.field == name
+
+
+@pytest.mark.parametrize(("name", "value"), [("replay.capacity", 32), ("env_steps", 32)])
+def test_the_smallest_value_that_is_named_is_accepted(name, value):
+    validate.check(changed(name, value))
+
+
+def test_unknown_presets_and_sizes_come_with_a_suggestion():
+    with pytest.raises(InvalidInput, match="preset='papr': did you mean 'paper'"):
+        validate.preset("papr")
+    with pytest.raises(InvalidInput, match="size='12': did you mean '12m'"):
+        validate.preset("quick", "12")

@@ -1,0 +1,245 @@
+"""The one loss that an update differentiates, in the order in which the data flows.
+
+    1 explain the batch   2 maximum likelihood   3 value alignment      make_world_model_loss
+    4 imagine   5 returns and their scale   6 critic and actor             make_behaviour_loss
+
+Both are pure functions of the same `Params`; their sum is the loss of `vawm.train`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from vawm import losses, returns, transforms
+from vawm.agent import Agent
+from vawm.config import Config
+from vawm.imagination import imagine
+from vawm.types import Array, Inference, Key, Latent, Metrics, Params, PyTree, Trajectory
+
+
+class Batch(NamedTuple):
+    """Replayed experience: T + 1 steps, the first of which only gives context."""
+
+    trajectory: Trajectory  # [B, T + 1, ...]
+    context: Latent  # [B, ...] the stored latent of step 0
+
+
+def make_value_alignment(agent: Agent, config: Config) -> Callable[..., tuple[Array, Array]]:
+    """Build `value_alignment(critic_params, inference, latent_kl, step) -> (loss, weight)`.
+
+    L_var of Eq. 4 and its weight of Eq. 5 at every state of a batch, both `[B, T]`. The
+    critic's parameters are stopped and the same for both latents; gradients reach the world
+    model through the latents, or only through z where `deter_gradient` is "stop".
+    """
+    alignment = config.value_alignment
+
+    def weight_of(kl: Array, step: Array) -> Array:
+        if alignment.weight == "off":
+            return jnp.zeros_like(kl)
+        if alignment.weight == "static":
+            gate = (step > alignment.warmup_steps).astype(kl.dtype)
+            return jnp.full_like(kl, alignment.static_weight) * gate
+        return losses.value_alignment_weight(kl, step, warmup_steps=alignment.warmup_steps)
+
+    def value_alignment(
+        critic: PyTree, inference: Inference, kl: Array, step: Array
+    ) -> tuple[Array, Array]:
+        critic = jax.lax.stop_gradient(critic)
+        latent, prior_latent = inference.latent, inference.prior_latent
+        if alignment.deter_gradient == "stop":
+            deter = jax.lax.stop_gradient(latent.deter)
+            latent = latent._replace(deter=deter)
+            prior_latent = prior_latent._replace(deter=deter)
+        loss = losses.value_alignment_loss(
+            agent.critic.logits(critic, latent),
+            agent.critic.logits(critic, prior_latent),
+            dynamics_scale=alignment.dynamics_scale,
+            representation_scale=alignment.representation_scale,
+        )
+        return loss * inference.has_prior, weight_of(kl, step) * inference.has_prior
+
+    return value_alignment
+
+
+def make_world_model_loss(agent: Agent, config: Config):
+    """Eq. 2: prediction, dynamics and value alignment of a batch.
+
+    Gradients reach the world model only.
+    """
+    model = config.world_model
+    value_alignment = make_value_alignment(agent, config)
+    reward_bins = transforms.symexp_bins(model.bins)
+    discount = 1.0 - 1.0 / config.imagination.discount_horizon
+
+    def loss_fn(
+        params: Params, slow_critic: PyTree, batch: Batch, key: Key, step: Array
+    ) -> tuple[Array, Inference, Metrics]:
+        steps = jax.tree.map(lambda x: x[:, 1:], batch.trajectory)
+        prev_action = batch.trajectory.action[:, :-1]
+        # 1. Explain the batch: what is it, and what could have been predicted?
+        _, inference = agent.world_model.observe(
+            params.world_model,
+            key,
+            batch.context,
+            steps.obs,
+            prev_action,
+            steps.is_first,
+            train=True,
+        )
+        predictions = agent.world_model.predict(params.world_model, inference.latent)
+        # 2. Maximum likelihood, Eq. 3.
+        prediction = losses.prediction_loss(
+            predictions.obs,
+            predictions.reward,
+            predictions.cont,
+            steps.obs,
+            steps.reward,
+            steps.is_terminal,
+            bins=reward_bins,
+            discount=discount,
+        )
+        dynamics, kl = losses.dynamics_loss(
+            inference.post_logits,
+            inference.prior_logits,
+            unimix=model.unimix,
+            free_nats=model.free_nats,
+            dynamics_scale=model.dynamics_scale,
+            representation_scale=model.representation_scale,
+        )
+        # 3. Value alignment, Eq. 4 and 5.
+        slow = config.value_alignment.critic == "slow"
+        critic = slow_critic if slow else params.critic
+        aligned, weight = value_alignment(critic, inference, kl, step)
+        parts = {
+            "loss/reconstruction": model.reconstruction_scale * prediction.reconstruction,
+            "loss/reward": prediction.reward,
+            "loss/continue": prediction.cont,
+            "loss/dynamics": dynamics,
+            "loss/value_alignment": weight * aligned,
+        }
+        parts = {name: jnp.mean(part) for name, part in parts.items()}
+        metrics = parts | {
+            "value_alignment/loss": jnp.mean(aligned),
+            "value_alignment/weight": jnp.mean(weight),
+            "latent/kl": jnp.mean(kl),
+        }
+        return sum(parts.values()), inference, metrics
+
+    return loss_fn
+
+
+def make_behaviour_loss(agent: Agent, config: Config):
+    """Eq. 7 and 8: critic and actor from imagination, critic from replay.
+
+    Imagined latents carry no gradient; the replay value loss reaches the world model
+    unless `critic.replay_gradient` is off.
+    """
+    imagination, critic_config = config.imagination, config.critic
+    discount = 1.0 - 1.0 / imagination.discount_horizon
+    reward_bins = transforms.symexp_bins(config.world_model.bins)
+    actor, critic, world_model = agent.actor, agent.critic, agent.world_model
+
+    def critic_loss(logits: Array, slow_logits: Array, target: Array) -> Array:
+        return losses.critic_loss(
+            logits,
+            critic.mean(slow_logits),
+            target,
+            bins=critic.bins,
+            slow_scale=critic_config.slow_scale,
+        )
+
+    def loss_fn(
+        params: Params,
+        slow_critic: PyTree,
+        scale_state: returns.ReturnScale,
+        batch: Batch,
+        inference: Inference,
+        key: Key,
+    ) -> tuple[Array, returns.ReturnScale, Metrics]:
+        frozen = jax.lax.stop_gradient(params)
+        steps = jax.tree.map(lambda x: x[:, 1:], batch.trajectory)
+        key_starts, key_imagine = jax.random.split(key)
+        # 4. Imagine H steps from every state of the batch.
+        carry, start = world_model.starts(
+            frozen.world_model, key_starts, batch.trajectory, inference
+        )
+        imagined = imagine(
+            world_model,
+            lambda latent: actor.policy(frozen.actor, latent),
+            frozen.world_model,
+            key_imagine,
+            carry,
+            start,
+            horizon=imagination.horizon,
+        )
+        # 5. Lambda-returns and their scale, Eq. 7 and 9.
+        predictions = world_model.predict(frozen.world_model, imagined.latent)
+        reward = transforms.two_hot_mean(predictions.reward, reward_bins)
+        cont = jax.nn.sigmoid(predictions.cont)
+        logits = critic.logits(params.critic, imagined.latent)
+        value = critic.mean(jax.lax.stop_gradient(logits))
+        weight = losses.discount_weights(cont)[:-1]
+        target = returns.lambda_returns(
+            reward[1:], cont[1:], value[1:], lambda_=imagination.lambda_
+        )
+        scale_state = returns.update_return_scale(
+            scale_state,
+            target,
+            decay=imagination.return_scale_decay,
+            low=imagination.return_scale_low,
+            high=imagination.return_scale_high,
+        )
+        scale = returns.return_scale(scale_state, limit=imagination.return_scale_limit)
+        advantage = (target - value[:-1]) / scale
+        # 6. Critic and actor, Eq. 7 and 8; the critic also from replay.
+        # Networks read all H + 1 latents and results are cut: cutting latents copies them.
+        slow_logits = critic.logits(slow_critic, imagined.latent)[:-1]
+        policy = actor.policy(params.actor, imagined.latent)
+        log_prob, entropy = policy.log_prob(imagined.action)[:-1], policy.entropy()[:-1]
+        replay_latent = inference.latent
+        if not critic_config.replay_gradient:
+            replay_latent = jax.lax.stop_gradient(replay_latent)
+        replay_target = returns.replay_returns(
+            steps.reward,
+            steps.is_last,
+            steps.is_terminal,
+            target[0].reshape(steps.reward.shape),
+            discount=discount,
+            lambda_=imagination.lambda_,
+        )
+        replay_loss = critic_loss(
+            critic.logits(params.critic, replay_latent)[:, :-1],
+            critic.logits(slow_critic, jax.lax.stop_gradient(replay_latent))[:, :-1],
+            replay_target,
+        )
+        parts = {
+            "loss/actor": config.actor.scale
+            * weight
+            * losses.actor_loss(
+                log_prob,
+                entropy,
+                advantage,
+                entropy_scale=config.actor.entropy_scale,
+            ),
+            "loss/critic": critic_config.scale
+            * weight
+            * critic_loss(logits[:-1], slow_logits, target),
+            "loss/replay_critic": critic_config.replay_scale
+            * (1.0 - steps.is_last[:, :-1])
+            * replay_loss,
+        }
+        parts = {name: jnp.mean(part) for name, part in parts.items()}
+        metrics = parts | {
+            "policy/entropy": jnp.mean(entropy),
+            "imagination/reward": jnp.mean(reward[1:]),
+            "imagination/return": jnp.mean(target),
+            "imagination/value": jnp.mean(value),
+            "imagination/return_scale": scale,
+        }
+        return sum(parts.values()), scale_state, metrics
+
+    return loss_fn
