@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import tyro
 
-from vawm import envs, train
+from vawm import envs, huge_pages, train
 from vawm.agent import make_agent, parameter_count
 from vawm.config import PAPER, SIZES, Config, ValueAlignmentConfig, with_size
 from vawm.errors import InvalidInput
@@ -188,4 +188,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    huge_pages.use_huge_pages()
     main()

@@ -13,7 +13,7 @@ import pathlib
 import sys
 from collections.abc import Sequence
 
-from vawm import cache, command_line, runner
+from vawm import cache, command_line, huge_pages, runner
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -32,4 +32,5 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
+    huge_pages.use_huge_pages()
     sys.exit(command_line.guard(main))

@@ -196,10 +196,10 @@ def make_behaviour_loss(agent: Agent, config: Config):
         scale = returns.return_scale(scale_state, limit=imagination.return_scale_limit)
         advantage = (target - value[:-1]) / scale
         # 6. Critic and actor, Eq. 7 and 8; the critic also from replay.
-        # Networks read all H + 1 latents and results are cut: cutting latents copies them.
-        slow_logits = critic.logits(slow_critic, imagined.latent)[:-1]
-        policy = actor.policy(params.actor, imagined.latent)
-        log_prob, entropy = policy.log_prob(imagined.action)[:-1], policy.entropy()[:-1]
+        before_last = jax.tree.map(lambda x: x[:-1], imagined.latent)
+        slow_logits = critic.logits(slow_critic, before_last)
+        policy = actor.policy(params.actor, before_last)
+        log_prob, entropy = policy.log_prob(imagined.action[:-1]), policy.entropy()
         replay_latent = inference.latent
         if not critic_config.replay_gradient:
             replay_latent = jax.lax.stop_gradient(replay_latent)
