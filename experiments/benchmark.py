@@ -15,6 +15,7 @@ import resource
 import statistics
 import time
 from dataclasses import dataclass
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -39,7 +40,7 @@ class Benchmark:
     actions: int = 6
     repeats: int = 8
     """timed updates of each kind"""
-    compute_dtype: str = "auto"
+    compute_dtype: Literal["auto", "float32", "bfloat16"] = "auto"
     task: str = "cartpole_swingup"
     """environment for env_steps_per_s"""
     num_envs: int = 16
@@ -102,7 +103,8 @@ class TimedUpdate:
             kept = {k: v for k, v in metrics.items() if aligned or "alignment" not in k}
             return learner, latent, kept
 
-        self.batch, self.seconds, self.key = batch, [], jax.random.key(1)
+        self.batch, self.key = batch, jax.random.key(1)
+        self.seconds: list[float] = []
         init = jax.jit(lambda key: train.init_learner(agent, config, key))
         self.learner = init(jax.random.key(0))
         begin = time.perf_counter()

@@ -53,7 +53,7 @@ def make_actor(
 
     def policy(params: PyTree, latent: Latent) -> Policy:
         outputs = net.apply({"params": params}, *features(latent))
-        outputs = [x.astype(jnp.float32) for x in outputs]
+        outputs = [jnp.asarray(x, jnp.float32) for x in outputs]
         if spec.discrete:
             return distributions.one_hot_categorical(*outputs, unimix=config.unimix)
         return distributions.bounded_normal(

@@ -126,6 +126,11 @@ class ReplayConfig:
     batch_size: int = 16
     batch_length: int = 64
 
+    @property
+    def batch_steps(self) -> int:
+        """Steps that one update replays."""
+        return self.batch_size * self.batch_length
+
 
 @dataclass(frozen=True)
 class Config:
@@ -201,13 +206,19 @@ PAPER = Config()
 QUICK = dataclasses.replace(
     with_size(PAPER, "1m"),
     preset="quick",
-    env_steps=30_000,
-    num_envs=4,
-    collect_steps=4,
-    log_every=1_000,
-    save_every=10_000,
-    value_alignment=ValueAlignmentConfig(warmup_steps=3_000),
+    env_steps=72_000,
+    num_envs=8,
+    action_repeat=4,
+    train_ratio=64,
+    log_every=2_000,
+    save_every=24_000,
+    imagination=ImaginationConfig(discount_horizon=150.0),
+    value_alignment=ValueAlignmentConfig(warmup_steps=7_200),
+    optimizer=OptimizerConfig(learning_rate=6e-4, warmup_updates=300),
+    replay=ReplayConfig(batch_size=8, batch_length=32),
 )
+"""For a CPU with 2 cores: steps in the simulation cost little there and updates much, so it
+takes few small updates at a high learning rate, and long actions."""
 
 PRESETS = {"quick": QUICK, "paper": PAPER}
 

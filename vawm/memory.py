@@ -96,7 +96,7 @@ def working_bytes(config: Config) -> int:
     )
     observed = 8 * feature + 4 * (layers * model.units + model.bins + 3 * critic.bins)
     imagined = 2 * feature + config.actor.layers * config.actor.units + 4 * critic.bins
-    steps = config.replay.batch_size * config.replay.batch_length
+    steps = config.replay.batch_steps
     numbers = steps * (observed + (config.imagination.horizon + 1) * imagined)
     return 4 * numbers + COMPILER_BYTES
 

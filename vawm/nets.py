@@ -66,7 +66,8 @@ class Linear(nn.Module):
         if sum(widths) != self.in_features:
             raise ValueError(f"Linear takes {self.in_features} features, got {widths}")
         starts = [sum(widths[:i]) for i in range(len(widths))]
-        return self.add_bias(sum(self.rows(x, s) for x, s in zip(inputs, starts, strict=True)))
+        first, *rest = (self.rows(x, s) for x, s in zip(inputs, starts, strict=True))
+        return self.add_bias(sum(rest, start=first))
 
 
 class Layer(nn.Module):

@@ -28,6 +28,11 @@ class Batch(NamedTuple):
     context: Latent  # [B, ...] the stored latent of step 0
 
 
+def total(parts: Metrics) -> Array:
+    """The sum of named scalars."""
+    return jnp.sum(jnp.stack(list(parts.values())))
+
+
 def make_value_alignment(agent: Agent, config: Config) -> Callable[..., tuple[Array, Array]]:
     """Build `value_alignment(critic_params, inference, latent_kl, step) -> (loss, weight)`.
 
@@ -127,7 +132,7 @@ def make_world_model_loss(agent: Agent, config: Config):
             "value_alignment/weight": jnp.mean(weight),
             "latent/kl": jnp.mean(kl),
         }
-        return sum(parts.values()), inference, metrics
+        return total(parts), inference, metrics
 
     return loss_fn
 
@@ -240,6 +245,6 @@ def make_behaviour_loss(agent: Agent, config: Config):
             "imagination/value": jnp.mean(value),
             "imagination/return_scale": scale,
         }
-        return sum(parts.values()), scale_state, metrics
+        return total(parts), scale_state, metrics
 
     return loss_fn

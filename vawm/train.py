@@ -65,6 +65,7 @@ class TrainState(NamedTuple):
 
 Update = Callable[[Learner, Batch, Key, Array], tuple[Learner, Latent, Metrics]]
 Collect = Callable[[Params, Collector, Replay, Key], tuple[Collector, Replay, Metrics]]
+Learn = Callable[[Learner, Replay, Key, Array, Array], tuple[Learner, Replay, Metrics]]
 TrainStep = Callable[[TrainState], tuple[TrainState, Metrics]]
 
 
@@ -181,23 +182,14 @@ def make_collect(env: Environment, agent: Agent, config: Config) -> Collect:
     return collect
 
 
-def make_train_step(env: Environment, agent: Agent, config: Config) -> TrainStep:
-    """Build `train_step(state) -> (state, metrics)`: collect K steps, then learn.
+def make_learn(agent: Agent, config: Config) -> Learn:
+    """Build `learn(learner, replay, key, env_steps, due) -> (learner, replay, metrics)`.
 
-    Every collected step of every environment owes `train_ratio` replayed steps; an update
-    replays batch_size * batch_length. From the first chunk on after which replay can fill
-    a batch with different sequences, the updates due run at once and the remainder is
-    carried over, so that their number is exactly
-    `floor(collected steps * train_ratio / (batch_size * batch_length))`.
-
-    Metrics: counters `env_steps`, `updates` (so far), `chunk/updates`, sums over finished
-    episodes `episode/*`, `env/nonfinite`, and means over this chunk's updates of the rest
-    (NaN when there was none).
+    `due` updates, each on a batch of its own, whose latents are written back before the
+    next is drawn. Metrics are means over the updates, NaN if there is none.
     """
-    collect = make_collect(env, agent, config)
-    update = jax.jit(make_update(agent, config))  # traced once, though its shapes are asked for
+    update = jax.jit(make_update(agent, config))  # so that asking for shapes is no second trace
     size, length = config.replay.batch_size, config.replay.batch_length
-    earned = config.collect_steps * config.num_envs * config.train_ratio
     classes = config.world_model.classes
 
     def draw(buffer: Replay, key: Key) -> tuple[Batch, replay.Positions]:
@@ -206,7 +198,9 @@ def make_train_step(env: Environment, agent: Agent, config: Config) -> TrainStep
         )
         return Batch(trajectory, context), positions._replace(time=positions.time[:, 1:])
 
-    def learn(learner: Learner, buffer: Replay, key: Key, env_steps: Array, due: Array):
+    def learn(
+        learner: Learner, buffer: Replay, key: Key, env_steps: Array, due: Array
+    ) -> tuple[Learner, Replay, Metrics]:
         batch, _ = jax.eval_shape(draw, buffer, key)
         metrics = jax.eval_shape(update, learner, batch, key, env_steps)[-1]
         sums = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), metrics)
@@ -223,19 +217,39 @@ def make_train_step(env: Environment, agent: Agent, config: Config) -> TrainStep
         learner, buffer, _, sums = jax.lax.fori_loop(0, due, one_update, state)
         return learner, buffer, jax.tree.map(lambda x: x / due, sums)
 
+    return learn
+
+
+def make_train_step(env: Environment, agent: Agent, config: Config) -> TrainStep:
+    """Build `train_step(state) -> (state, metrics)`: collect K steps, then learn.
+
+    Every collected step of every environment owes `train_ratio` replayed steps; an update
+    replays batch_size * batch_length. From the first chunk on after which replay can fill
+    a batch with different sequences, the updates due run at once and the remainder is
+    carried over, so that their number is exactly
+    `floor(collected steps * train_ratio / (batch_size * batch_length))`.
+
+    Metrics: counters `env_steps`, `updates` (so far), `chunk/updates`, sums over finished
+    episodes `episode/*`, `env/nonfinite`, and means over this chunk's updates of the rest
+    (NaN when there was none).
+    """
+    collect = make_collect(env, agent, config)
+    learn = make_learn(agent, config)
+    length, batch_steps = config.replay.batch_length, config.replay.batch_steps
+    earned = config.collect_steps * config.num_envs * config.train_ratio
+
     def train_step(state: TrainState) -> tuple[TrainState, Metrics]:
         key, key_collect, key_learn = jax.random.split(state.key, 3)
-        collector, buffer, metrics = collect(
+        collector, buffer, collected = collect(
             state.learner.params, state.collector, state.replay, key_collect
         )
-        ready = replay.num_starts(buffer, length + 1) >= size * length
+        ready = replay.num_starts(buffer, length + 1) >= batch_steps
         credit = state.credit + jnp.where(ready, earned, 0)
-        due = credit // (size * length)
-        learner, buffer, means = learn(
+        due = credit // batch_steps
+        learner, buffer, learned = learn(
             state.learner, buffer, key_learn, collector.env_steps, due
         )
-        metrics |= means
-        metrics |= {
+        counters = {
             "env_steps": collector.env_steps,
             "updates": learner.step,
             "chunk/updates": due,
@@ -244,10 +258,10 @@ def make_train_step(env: Environment, agent: Agent, config: Config) -> TrainStep
             learner=learner,
             collector=collector,
             replay=buffer,
-            credit=credit - due * size * length,
+            credit=credit - due * batch_steps,
             key=key,
         )
-        return state, metrics
+        return state, counters | collected | learned
 
     return train_step
 

@@ -135,7 +135,7 @@ def _check_widths(config: Config) -> None:
 def _check_replay(config: Config) -> None:
     """Learning starts when replay holds as many sequences as a batch has steps."""
     replay = config.replay
-    batch_steps = replay.batch_size * replay.batch_length
+    batch_steps = replay.batch_steps
     needed = replay.batch_length + -(-batch_steps // config.num_envs)  # in each environment
     if replay.capacity // config.num_envs < needed:
         remedy = (

@@ -11,6 +11,7 @@ from typing import Any
 
 import gymnasium
 import jax
+import jax.numpy as jnp
 import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
@@ -29,7 +30,7 @@ class SingleEnv(gymnasium.Env):
     def __init__(self, task: str, action_repeat: int = 1):
         self._env = compiled(envs.make(task, num_envs=1, action_repeat=action_repeat))
         self.observation_space, self.action_space = make_spaces(self._env.spec)
-        self._state = None
+        self._state: Any = None  # an EnvState after the first reset
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
         """A fresh random episode; equal seeds give equal episodes."""
@@ -39,7 +40,7 @@ class SingleEnv(gymnasium.Env):
 
     def step(self, action):
         """`action_repeat` control steps; actions outside [-1, 1] are clipped."""
-        action = np.asarray(action, np.float32)[None]
+        action = jnp.asarray(action, jnp.float32)[None]
         self._state, timestep = self._env.step(self._state, action)
         obs, reward, terminated, truncated = outcome(timestep)
         failed = bool(self._state.steps[0] < 0)
@@ -61,7 +62,7 @@ class BatchedEnv(VectorEnv):
         self.single_observation_space, self.single_action_space = make_spaces(self._env.spec)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._state = None
+        self._state: Any = None  # an EnvState after the first reset
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
         """All environments start an episode; one seed serves them all."""
@@ -71,7 +72,7 @@ class BatchedEnv(VectorEnv):
 
     def step(self, actions):
         """`action_repeat` control steps in each environment."""
-        self._state, timestep = self._env.step(self._state, np.asarray(actions, np.float32))
+        self._state, timestep = self._env.step(self._state, jnp.asarray(actions, jnp.float32))
         failed = np.asarray(self._state.steps) < 0
         info = {"physics_failed": failed, "_physics_failed": failed} if failed.any() else {}
         return *outcome(timestep), info

@@ -1,0 +1,186 @@
+"""Learning curves of `dmc_proprio.py`: tasks x seeds, with and without value alignment.
+
+    python experiments/learning_curves.py --jobs 2
+
+Runs what is missing under `--runs`, `--jobs` at a time (on Linux each on cores of its own), and
+writes `curves.csv` and `curves.png` to `--results`. Interrupted runs are resumed.
+"""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import json
+import os
+import pathlib
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+
+import tyro
+
+EXPERIMENT = pathlib.Path(__file__).with_name("dmc_proprio.py")
+COLUMNS = ("task", "alignment", "seed", "env_steps", "updates", "minutes", "return")
+
+
+@dataclass(frozen=True)
+class Options:
+    """Which runs, and where they go."""
+
+    tasks: tuple[str, ...] = ("cartpole_swingup", "cartpole_balance")
+    seeds: tuple[int, ...] = (0, 1, 2)
+    alignments: tuple[str, ...] = ("adaptive", "off")
+    """values of --value-alignment.weight"""
+    preset: str = "quick"
+    jobs: int = 1
+    """runs side by side"""
+    runs: pathlib.Path = pathlib.Path("runs/learning_curves")
+    results: pathlib.Path = pathlib.Path(__file__).with_name("results")
+    collect_only: bool = False
+    """write the results of the runs that are there, and start none"""
+
+
+@dataclass(frozen=True)
+class Run:
+    task: str
+    alignment: str
+    seed: int
+
+    def folder(self, options: Options) -> pathlib.Path:
+        return options.runs / f"{self.task}-{self.alignment}-seed{self.seed}"
+
+    def command(self, options: Options) -> list[str]:
+        folder = self.folder(options)
+        arguments = {
+            "--task": self.task,
+            "--preset": options.preset,
+            "--seed": str(self.seed),
+            "--value-alignment.weight": self.alignment,
+            "--logdir": str(folder),
+        }
+        resume = ["--resume"] if (folder / "config.json").exists() else []
+        return [sys.executable, str(EXPERIMENT), *itertools.chain(*arguments.items()), *resume]
+
+
+def all_runs(options: Options) -> list[Run]:
+    """Seeds outermost, so that an early stop leaves whole comparisons."""
+    product = itertools.product(options.seeds, options.alignments, options.tasks)
+    return [Run(task, alignment, seed) for seed, alignment, task in product]
+
+
+def train(options: Options) -> None:
+    """Keeps `jobs` runs going, each with its share of the cores."""
+    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+    shares = [cores[i :: options.jobs] for i in range(options.jobs)]
+    waiting, running = all_runs(options), dict[int, tuple[Run, subprocess.Popen]]()
+    while waiting or running:
+        for slot in range(options.jobs):
+            if slot in running and running[slot][1].poll() is not None:
+                run, process = running.pop(slot)
+                print(f"{run}: exit code {process.returncode}", flush=True)
+            if slot not in running and waiting:
+                running[slot] = waiting[0], start(waiting.pop(0), options, shares[slot])
+        time.sleep(1)
+
+
+def start(run: Run, options: Options, cores: list[int]) -> subprocess.Popen:
+    folder = run.folder(options)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    log = folder.with_suffix(".log").open("a")
+    pin = (lambda: os.sched_setaffinity(0, cores)) if cores else None
+    return subprocess.Popen(run.command(options), stdout=log, stderr=log, preexec_fn=pin)
+
+
+def read(options: Options) -> list[dict]:
+    """A row per line of metrics in which episodes ended."""
+    rows = []
+    for run in all_runs(options):
+        path = run.folder(options) / "metrics.jsonl"
+        for line in path.read_text().splitlines() if path.exists() else ():
+            metrics = json.loads(line)
+            if metrics["episode/return"] is not None:
+                rows.append(
+                    {
+                        "task": run.task,
+                        "alignment": run.alignment,
+                        "seed": run.seed,
+                        "env_steps": metrics["env_steps"],
+                        "updates": metrics["updates"],
+                        "minutes": round(metrics["time"] / 60, 2),
+                        "return": round(metrics["episode/return"], 1),
+                    }
+                )
+    return rows
+
+
+def write_csv(rows: list[dict], path: pathlib.Path) -> None:
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def plot(rows: list[dict], options: Options, path: pathlib.Path) -> None:
+    """A panel per task, a line per seed, a colour per kind of alignment."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, panels = plt.subplots(
+        1, len(options.tasks), figsize=(4.5 * len(options.tasks), 3.2), squeeze=False
+    )
+    for panel, task in zip(panels[0], options.tasks, strict=True):
+        for color, alignment in enumerate(options.alignments):
+            for seed in options.seeds:
+                chosen = [
+                    row
+                    for row in rows
+                    if (row["task"], row["alignment"], row["seed"]) == (task, alignment, seed)
+                ]
+                panel.plot(
+                    [row["env_steps"] for row in chosen],
+                    [row["return"] for row in chosen],
+                    color=f"C{color}",
+                    label=f"value alignment {alignment}" if seed == options.seeds[0] else None,
+                )
+        panel.set(title=task, xlabel="environment steps", ylabel="return", ylim=(0, 1000))
+    panels[0][0].legend()
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
+
+
+def summary(rows: list[dict], options: Options) -> str:
+    """Per run: the return of its last episodes, its best, and how long it took."""
+    lines = []
+    for run in all_runs(options):
+        own = [
+            r
+            for r in rows
+            if (r["task"], r["alignment"], r["seed"]) == tuple(vars(run).values())
+        ]
+        if own:
+            best = max(row["return"] for row in own)
+            last = own[-1]
+            lines.append(
+                f"{run.task:18} {run.alignment:9} seed {run.seed}: last {last['return']:6.1f} "
+                f"best {best:6.1f} at {last['env_steps']} env steps, "
+                f"{last['updates']} updates, {last['minutes']} min"
+            )
+    return "\n".join(lines)
+
+
+def main() -> None:
+    options = tyro.cli(Options, description=__doc__)
+    if not options.collect_only:
+        train(options)
+    rows = read(options)
+    options.results.mkdir(parents=True, exist_ok=True)
+    write_csv(rows, options.results / "curves.csv")
+    plot(rows, options, options.results / "curves.png")
+    print(summary(rows, options))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,105 @@
+"""Imports point downwards, and libraries with one importer keep it."""
+
+import ast
+import pathlib
+
+import pytest
+
+PACKAGE = pathlib.Path(__file__).parents[1] / "vawm"
+
+# What each room may import of ours, besides itself. Rooms are modules or folders.
+LAYERS = {
+    "errors": set(),
+    "config": set(),
+    "huge_pages": set(),
+    "cache": set(),
+    "types": set(),
+    "transforms": set(),
+    "signals": set(),
+    "losses": {"transforms"},
+    "returns": {"types"},
+    "distributions": {"transforms"},
+    "optim": {"config"},
+    "nets": {"types"},
+    "replay": {"config", "types"},
+    "envs": {"errors", "types"},
+    "world_model": {"config", "distributions", "errors", "nets", "transforms", "types"},
+    "actor_critic": {"config", "distributions", "nets", "transforms", "types"},
+    "imagination": {"distributions", "types", "world_model"},
+    "agent": {"actor_critic", "config", "types", "world_model"},
+    "objective": {
+        "agent",
+        "config",
+        "imagination",
+        "losses",
+        "returns",
+        "transforms",
+        "types",
+    },
+    "train": {"agent", "config", "envs", "objective", "optim", "replay", "returns", "types"},
+}
+HOST = {
+    "checkpoint",
+    "command_line",
+    "display",
+    "evaluate",
+    "manifest",
+    "memory",
+    "policy",
+    "resume",
+    "rundir",
+    "runner",
+    "tracking",
+    "validate",
+}
+SOLE_IMPORTERS = {"flax": {"nets"}, "distrax": {"distributions"}, "optax": {"optim", "train"}}
+
+
+def rooms():
+    for path in sorted(PACKAGE.rglob("*.py")):
+        room = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+        if room != "__init__":
+            yield room, path
+
+
+def imports(path):
+    """Dotted names that a file imports, and `package.name` of each `from` import."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def ours(path):
+    """Rooms of ours that a file imports."""
+    return {name.split(".")[1] for name in imports(path) if name.startswith("vawm.")}
+
+
+@pytest.mark.parametrize("room", sorted(LAYERS))
+def test_imports_point_downwards(room):
+    paths = [path for name, path in rooms() if name == room]
+    assert paths, f"no room {room}"
+    used = set().union(*(ours(path) for path in paths)) - {room}
+    assert used <= LAYERS[room]
+
+
+def test_every_room_has_its_place():
+    assert {room for room, _ in rooms()} == set(LAYERS) | HOST
+
+
+def test_nothing_that_computes_imports_the_host_side():
+    for room, path in rooms():
+        if room not in HOST:
+            assert not ours(path) & HOST, path
+
+
+@pytest.mark.parametrize("library", SOLE_IMPORTERS)
+def test_libraries_with_one_importer_keep_it(library):
+    importers = {
+        room
+        for room, path in rooms()
+        if any(name.split(".")[0] == library for name in imports(path))
+    }
+    assert importers == SOLE_IMPORTERS[library]
