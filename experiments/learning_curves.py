@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import tyro
 
 EXPERIMENT = pathlib.Path(__file__).with_name("dmc_proprio.py")
+RESULTS = pathlib.Path(__file__).with_name("results")
 COLUMNS = ("task", "alignment", "seed", "env_steps", "updates", "minutes", "return")
 
 
@@ -36,7 +37,7 @@ class Options:
     jobs: int = 1
     """runs side by side"""
     runs: pathlib.Path = pathlib.Path("runs/learning_curves")
-    results: pathlib.Path = pathlib.Path(__file__).with_name("results")
+    results: pathlib.Path = RESULTS
     collect_only: bool = False
     """write the results of the runs that are there, and start none"""
 
@@ -134,11 +135,8 @@ def plot(rows: list[dict], options: Options, path: pathlib.Path) -> None:
     for panel, task in zip(panels[0], options.tasks, strict=True):
         for color, alignment in enumerate(options.alignments):
             for seed in options.seeds:
-                chosen = [
-                    row
-                    for row in rows
-                    if (row["task"], row["alignment"], row["seed"]) == (task, alignment, seed)
-                ]
+                run = Run(task, alignment, seed)
+                chosen = [row for row in rows if row.items() >= vars(run).items()]
                 panel.plot(
                     [row["env_steps"] for row in chosen],
                     [row["return"] for row in chosen],
@@ -155,11 +153,7 @@ def summary(rows: list[dict], options: Options) -> str:
     """Per run: the return of its last episodes, its best, and how long it took."""
     lines = []
     for run in all_runs(options):
-        own = [
-            r
-            for r in rows
-            if (r["task"], r["alignment"], r["seed"]) == tuple(vars(run).values())
-        ]
+        own = [row for row in rows if row.items() >= vars(run).items()]
         if own:
             best = max(row["return"] for row in own)
             last = own[-1]

@@ -26,7 +26,8 @@ CONFIG = dataclasses.replace(
         tiny.CONFIG.world_model, deter=64, hidden=32, units=32, bins=101
     ),
     actor=dataclasses.replace(tiny.CONFIG.actor, units=32, entropy_scale=3e-4),
-    critic=dataclasses.replace(tiny.CONFIG.critic, units=32, bins=101),
+    # The slow critic follows at once: these values do not need steadying.
+    critic=dataclasses.replace(tiny.CONFIG.critic, units=32, bins=101, slow_rate=0.2),
     imagination=dataclasses.replace(tiny.CONFIG.imagination, horizon=5, discount_horizon=10.0),
     optimizer=dataclasses.replace(tiny.CONFIG.optimizer, learning_rate=2e-3, warmup_updates=20),
     replay=dataclasses.replace(

@@ -206,7 +206,7 @@ PAPER = Config()
 QUICK = dataclasses.replace(
     with_size(PAPER, "1m"),
     preset="quick",
-    env_steps=72_000,
+    env_steps=120_000,
     num_envs=8,
     action_repeat=4,
     train_ratio=64,
