@@ -21,7 +21,7 @@ LAYERS = {
     "distributions": {"transforms"},
     "optim": {"config"},
     "nets": {"types"},
-    "replay": {"config", "types"},
+    "replay": {"types"},
     "envs": {"errors", "types"},
     "world_model": {"config", "distributions", "errors", "nets", "transforms", "types"},
     "actor_critic": {"config", "distributions", "nets", "transforms", "types"},

@@ -89,6 +89,7 @@ RUNGS = [
     ("observation_reward", 400, 0.15),
     ("action_reward", 800, 0.35),  # of values up to 3.4, with a policy that still explores
     ("action_reward_discrete", 400, 0.2),
+    ("observation_action", 1000, 0.5),
     ("observation_action_discrete", 600, 0.25),
     ("memory_discrete", 1200, 0.25),
 ]

@@ -187,3 +187,41 @@ def test_alignment_can_read_the_slow_critic():
     online = full_gradients(ON, replay_gradient=True)[2]["value_alignment/loss"]
     slow = full_gradients(SLOW, replay_gradient=False)[2]["value_alignment/loss"]
     assert online != slow
+
+
+def products(alignment):
+    """Matrix products in the compiled gradient of the world model's loss, metrics dropped."""
+    agent, config = make(alignment)
+    model_loss = objective.make_world_model_loss(agent, config)
+
+    def loss(params):
+        data, key = batch(agent), jax.random.key(1)
+        return model_loss(params, params.critic, data, key, jnp.asarray(1))[0]
+
+    hlo = jax.jit(jax.grad(loss)).lower(params()).compile().as_text()
+    return hlo.count(" dot(") + hlo.count("dot_general")
+
+
+def test_switched_off_its_products_are_not_computed():
+    off = dataclasses.replace(ON, weight="off")
+    assert products(off) < products(ON)
+
+
+def test_shared_noise_gives_no_loss_where_prior_equals_posterior():
+    agent, config = make(dataclasses.replace(ON, noise="shared"))
+
+    @jax.jit
+    def aligned(params):
+        rssm = dict(params.world_model["rssm"])
+        heads = {"posterior_out": rssm["posterior_out"], "prior_net": dict(rssm["prior_net"])}
+        rssm["posterior_out"] = jax.tree.map(jnp.zeros_like, heads["posterior_out"])
+        out = jax.tree.map(jnp.zeros_like, heads["prior_net"]["heads_0"])
+        rssm["prior_net"] = heads["prior_net"] | {"heads_0": out}
+        params = params._replace(world_model=params.world_model | {"rssm": rssm})
+        key = jax.random.key(1)
+        metrics = objective.make_world_model_loss(agent, config)(
+            params, params.critic, batch(agent), key, jnp.asarray(1)
+        )[2]
+        return metrics["value_alignment/loss"]
+
+    assert aligned(params()) == 0.0

@@ -1,15 +1,12 @@
 """The replay buffer against a list of Python lists."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tiny import CONFIG
 
 from vawm import replay
-from vawm.types import Latent, Trajectory
+from vawm.types import EnvSpec, Latent, Trajectory
 
 CLASSES = 3
 
@@ -113,7 +110,14 @@ def test_adding_more_steps_than_fit_is_refused():
 
 
 def test_capacity_is_shared_by_environments_and_bounded_by_the_run():
-    config = dataclasses.replace(CONFIG, env_steps=10**6, num_envs=4)
-    assert replay.capacity_per_env(config) == CONFIG.replay.capacity // 4
-    short = dataclasses.replace(CONFIG, env_steps=32)
-    assert 16 <= replay.capacity_per_env(short) <= 24
+    spec = EnvSpec("test", (1,), "float32", 1, False, 4, 5, 200)
+
+    def capacity(env_steps, collect_steps=1):
+        return replay.capacity_per_env(
+            1000, spec, env_steps=env_steps, collect_steps=collect_steps
+        )
+
+    assert capacity(10**6) == 250
+    assert capacity(1000) == 51  # 1000 / (4 * 5) calls and one reset
+    assert capacity(4000) == 202  # a second reset after 200 calls
+    assert capacity(1000, collect_steps=20) == 60

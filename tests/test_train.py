@@ -171,6 +171,7 @@ def test_physics_that_fails_is_counted_and_never_stored():
             """Every third call ends the episode early, as a non-finite state does."""
             state, timestep = env.step(state, action)
             failed = state.steps == 3
+            state = state._replace(steps=jnp.where(failed, -3, state.steps))
             return state, timestep._replace(is_last=timestep.is_last | failed)
 
         return env._replace(step=step)

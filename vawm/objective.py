@@ -54,6 +54,8 @@ def make_value_alignment(agent: Agent, config: Config) -> Callable[..., tuple[Ar
         critic: PyTree, inference: Inference, kl: Array, step: Array
     ) -> tuple[Array, Array]:
         critic = jax.lax.stop_gradient(critic)
+        if alignment.weight == "off":  # no backward pass either
+            inference = jax.lax.stop_gradient(inference)
         latent, prior_latent = inference.latent, inference.prior_latent
         if alignment.deter_gradient == "stop":
             deter = jax.lax.stop_gradient(latent.deter)
@@ -124,10 +126,13 @@ def make_world_model_loss(agent: Agent, config: Config):
             "loss/reward": prediction.reward,
             "loss/continue": prediction.cont,
             "loss/dynamics": dynamics,
-            "loss/value_alignment": weight * aligned,
         }
         parts = {name: jnp.mean(part) for name, part in parts.items()}
-        metrics = parts | {
+        loss_var = {"loss/value_alignment": jnp.mean(weight * aligned)}
+        if config.value_alignment.weight != "off":
+            parts |= loss_var
+        metrics = parts | loss_var
+        metrics |= {
             "value_alignment/loss": jnp.mean(aligned),
             "value_alignment/weight": jnp.mean(weight),
             "latent/kl": jnp.mean(kl),

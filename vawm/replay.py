@@ -13,8 +13,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from vawm.config import Config
-from vawm.types import Array, Key, Latent, Trajectory
+from vawm.types import Array, EnvSpec, Key, Latent, Trajectory
 
 
 class Replay(NamedTuple):
@@ -31,16 +30,21 @@ class Positions(NamedTuple):
     time: Array  # [B, L]
 
 
-def capacity_per_env(config: Config) -> int:
-    """Steps kept of each environment: never more than the run collects.
+def capacity_per_env(
+    capacity: int, spec: EnvSpec, *, env_steps: int, collect_steps: int
+) -> int:
+    """Steps to keep of each environment: its share, but never more than a run collects.
 
-    A run of `env_steps` control steps makes at most twice as many calls as it has
-    decisions (a reset follows each episode), and collects in whole chunks.
+    Args:
+      capacity: steps of all environments together.
+      spec: of the environment; every full episode adds a reset to its control steps.
+      env_steps: control steps of the run.
+      collect_steps: K, the run collects in chunks of so many steps.
     """
-    calls = -(-config.env_steps // (config.num_envs * config.action_repeat))
-    resets = -(-calls // 100) + 1  # generous: full episodes have 1000 / action_repeat calls
-    collected = -(-(calls + resets) // config.collect_steps) * config.collect_steps
-    return max(1, min(config.replay.capacity // config.num_envs, collected))
+    calls = -(-env_steps // (spec.num_envs * spec.action_repeat))
+    resets = calls // spec.episode_length + 1 if spec.episode_length else 0
+    collected = -(-(calls + resets) // collect_steps) * collect_steps
+    return max(1, min(capacity // spec.num_envs, collected))
 
 
 def init(example: Trajectory, latent: Latent, *, capacity: int) -> Replay:

@@ -152,7 +152,7 @@ def make_collect(env: Environment, agent: Agent, config: Config) -> Collect:
             "episode/count": jnp.sum(ended),
             "episode/return": jnp.sum(jnp.where(ended, episode_return, 0.0)),
             "episode/length": jnp.sum(jnp.where(ended, episode_length, 0)),
-            "env/nonfinite": jnp.sum(cut_short(timestep, episode_length)),
+            "env/nonfinite": jnp.sum(ended & (env_state.steps < 0)),
         }
         collector = Collector(
             env_state=env_state,
@@ -163,12 +163,6 @@ def make_collect(env: Environment, agent: Agent, config: Config) -> Collect:
             episode_length=episode_length,
         )
         return collector, (stored, metrics)
-
-    def cut_short(timestep: TimeStep, length: Array) -> Array:
-        """Where an episode ended early without a terminal state: the physics failed."""
-        if env.spec.episode_length is None:
-            return jnp.zeros_like(timestep.is_last)
-        return timestep.is_last & ~timestep.is_terminal & (length < env.spec.episode_length)
 
     def collect(params: Params, collector: Collector, buffer: Replay, key: Key):
         keys = jax.random.split(key, config.collect_steps)
@@ -272,6 +266,12 @@ def init(env: Environment, agent: Agent, config: Config, key: Key) -> TrainState
     env_state, timestep = env.reset(key_env)
     carry = agent.initial(config.num_envs)
     example = Trajectory(*timestep, action=carry.action)
+    capacity = replay.capacity_per_env(
+        config.replay.capacity,
+        env.spec,
+        env_steps=config.env_steps,
+        collect_steps=config.collect_steps,
+    )
     return TrainState(
         learner=init_learner(agent, config, key_learner),
         collector=Collector(
@@ -282,7 +282,7 @@ def init(env: Environment, agent: Agent, config: Config, key: Key) -> TrainState
             episode_return=jnp.zeros(config.num_envs),
             episode_length=jnp.zeros(config.num_envs, jnp.int32),
         ),
-        replay=replay.init(example, carry.latent, capacity=replay.capacity_per_env(config)),
+        replay=replay.init(example, carry.latent, capacity=capacity),
         credit=jnp.zeros((), jnp.int32),
         key=key,
     )
