@@ -13,17 +13,20 @@ import dataclasses
 import json
 import resource
 import statistics
+import sys
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import jax
 import jax.numpy as jnp
-import tyro
 
-from vawm import envs, huge_pages, train
+from vawm import envs, flags, huge_pages, train, validate
 from vawm.agent import make_agent, parameter_count
+from vawm.command_line import guard
 from vawm.config import PAPER, SIZES, Config, ValueAlignmentConfig, with_size
+from vawm.envs.protocol import check_positive
 from vawm.errors import InvalidInput
 from vawm.types import EnvSpec, Latent, Trajectory
 
@@ -50,19 +53,19 @@ class Benchmark:
     """print one JSON object and nothing else"""
 
 
+def check(options: Benchmark) -> None:
+    """Refuses what cannot be measured, before anything is compiled."""
+    validate.check_choice("size", options.size, SIZES)
+    envs.check_task(options.task)
+    for field in dataclasses.fields(options):
+        value = getattr(options, field.name)
+        if field.type == "int":
+            check_positive(field.name, value)
+            if value >= validate.INT32:
+                raise InvalidInput(field.name, value, f"use a number below {validate.INT32}")
+
+
 def make_config(options: Benchmark) -> Config:
-    if options.size not in SIZES:
-        raise InvalidInput("size", options.size, f"choose one of {', '.join(SIZES)}")
-    for field in (
-        "batch_size",
-        "batch_length",
-        "observations",
-        "actions",
-        "repeats",
-        "env_calls",
-    ):
-        if getattr(options, field) < 1:
-            raise InvalidInput(field, getattr(options, field), "give a positive number")
     return dataclasses.replace(
         with_size(PAPER, options.size),
         compute_dtype=options.compute_dtype,
@@ -175,20 +178,20 @@ def run(options: Benchmark) -> dict:
     }
 
 
-def main() -> None:
-    options = tyro.cli(Benchmark, description=__doc__)
+def main(argv: Sequence[str] | None = None) -> int:
+    """Prints what was measured; returns the exit code."""
+    options = flags.read(Benchmark, argv, description=__doc__)
+    check(options)
     jax.config.update("jax_enable_compilation_cache", False)  # compile_s is a cold figure
-    try:
-        result = run(options)
-    except InvalidInput as error:
-        raise SystemExit(f"error: {error}") from None
+    result = run(options)
     if options.json:
         print(json.dumps(result))
     else:
         for name, value in result.items():
             print(f"{name:>20}  {value}")
+    return 0
 
 
 if __name__ == "__main__":
     huge_pages.use_huge_pages()
-    main()
+    sys.exit(guard(main))

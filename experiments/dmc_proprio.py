@@ -18,14 +18,14 @@ from vawm import cache, command_line, huge_pages, runner
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Trains one agent; returns the exit code."""
-    cache.enable()
     arguments = command_line.parse(argv, preset="quick", description=__doc__)
     runner.check(arguments.config, arguments.logdir, resume=arguments.resume)
-    print(command_line.describe(arguments.config), flush=True)
+    cache.enable()
     result = runner.run(
         arguments.config,
         arguments.logdir,
         resume=arguments.resume,
+        banner=command_line.describe(arguments.config),
         command=f"python {pathlib.Path(sys.argv[0])}",
     )
     return result.exit_code

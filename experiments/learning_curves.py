@@ -3,22 +3,27 @@
     python experiments/learning_curves.py --jobs 2
 
 Runs what is missing under `--runs`, `--jobs` at a time (on Linux each on cores of its own), and
-writes `curves.csv` and `curves.png` to `--results`. Interrupted runs are resumed.
+writes `curves.csv` and `curves.png` to `--results`. Interrupted runs are resumed, finished
+ones left alone.
 """
 
 from __future__ import annotations
 
 import csv
+import dataclasses
+import importlib.util
 import itertools
-import json
 import os
 import pathlib
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-import tyro
+from vawm import checkpoint, command_line, envs, flags, rundir, tracking, validate
+from vawm.envs.protocol import check_positive
+from vawm.runner import RunError
 
 EXPERIMENT = pathlib.Path(__file__).with_name("dmc_proprio.py")
 RESULTS = pathlib.Path(__file__).with_name("results")
@@ -34,6 +39,8 @@ class Options:
     alignments: tuple[str, ...] = ("adaptive", "off")
     """values of --value-alignment.weight"""
     preset: str = "quick"
+    env_steps: int | None = None
+    """length of every run; that of the preset if not given"""
     jobs: int = 1
     """runs side by side"""
     runs: pathlib.Path = pathlib.Path("runs/learning_curves")
@@ -60,8 +67,18 @@ class Run:
             "--value-alignment.weight": self.alignment,
             "--logdir": str(folder),
         }
-        resume = ["--resume"] if (folder / "config.json").exists() else []
+        if options.env_steps is not None:
+            arguments["--env-steps"] = str(options.env_steps)
+        resume = [] if rundir.read_config(folder) is None else ["--resume"]
         return [sys.executable, str(EXPERIMENT), *itertools.chain(*arguments.items()), *resume]
+
+    def finished(self, options: Options) -> bool:
+        """Whether the newest checkpoint is at the end already."""
+        folder = self.folder(options)
+        newest, config = checkpoint.latest(folder), rundir.read_config(folder)
+        if newest is None or config is None:
+            return False
+        return int(newest.name) >= (options.env_steps or config.env_steps)
 
 
 def all_runs(options: Options) -> list[Run]:
@@ -70,19 +87,47 @@ def all_runs(options: Options) -> list[Run]:
     return [Run(task, alignment, seed) for seed, alignment, task in product]
 
 
-def train(options: Options) -> None:
-    """Keeps `jobs` runs going, each with its share of the cores."""
+def check(options: Options) -> None:
+    """Refuses what would only fail in every run, or after hours of them.
+
+    Raises:
+      InvalidInput: names the option, its value and the remedy.
+      RunError: a package is missing.
+    """
+    config = validate.preset(options.preset)
+    if options.env_steps is not None:
+        validate.check(dataclasses.replace(config, env_steps=options.env_steps))
+    weights = flags.choices(type(config.value_alignment), "weight")
+    for weight in options.alignments:
+        validate.check_choice("alignments", weight, weights)
+    for task in options.tasks:
+        envs.check_task(task)
+    check_positive("jobs", options.jobs)
+    if importlib.util.find_spec("matplotlib") is None:
+        raise RunError("matplotlib is missing: pip install matplotlib (or vawm[notebooks])")
+
+
+def train(options: Options) -> dict[Run, int]:
+    """Keeps `jobs` runs going, each with its share of the cores.
+
+    Returns:
+      The exit codes other than 0.
+    """
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
     shares = [cores[i :: options.jobs] for i in range(options.jobs)]
-    waiting, running = all_runs(options), dict[int, tuple[Run, subprocess.Popen]]()
+    waiting = [run for run in all_runs(options) if not run.finished(options)]
+    running, failed = dict[int, tuple[Run, subprocess.Popen]](), dict[Run, int]()
     while waiting or running:
         for slot in range(options.jobs):
             if slot in running and running[slot][1].poll() is not None:
                 run, process = running.pop(slot)
                 print(f"{run}: exit code {process.returncode}", flush=True)
+                if process.returncode:
+                    failed[run] = process.returncode
             if slot not in running and waiting:
                 running[slot] = waiting[0], start(waiting.pop(0), options, shares[slot])
         time.sleep(1)
+    return failed
 
 
 def start(run: Run, options: Options, cores: list[int]) -> subprocess.Popen:
@@ -98,8 +143,7 @@ def read(options: Options) -> list[dict]:
     rows = []
     for run in all_runs(options):
         path = run.folder(options) / "metrics.jsonl"
-        for line in path.read_text().splitlines() if path.exists() else ():
-            metrics = json.loads(line)
+        for metrics in tracking.read(path) if path.exists() else ():
             if metrics["episode/return"] is not None:
                 rows.append(
                     {
@@ -165,16 +209,21 @@ def summary(rows: list[dict], options: Options) -> str:
     return "\n".join(lines)
 
 
-def main() -> None:
-    options = tyro.cli(Options, description=__doc__)
-    if not options.collect_only:
-        train(options)
+def main(argv: Sequence[str] | None = None) -> int:
+    """Trains and plots; returns the exit code, 1 if a run failed."""
+    options = flags.read(Options, argv, description=__doc__)
+    check(options)
+    failed = {} if options.collect_only else train(options)
     rows = read(options)
     options.results.mkdir(parents=True, exist_ok=True)
     write_csv(rows, options.results / "curves.csv")
     plot(rows, options, options.results / "curves.png")
     print(summary(rows, options))
+    for run, code in failed.items():
+        log = run.folder(options).with_suffix(".log")
+        print(f"error: {run} ended with exit code {code}, see {log}", file=sys.stderr)
+    return 1 if failed else 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(command_line.guard(main))

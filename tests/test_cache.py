@@ -41,7 +41,10 @@ def test_it_can_be_switched_off(monkeypatch):
     assert not jax.config.jax_enable_compilation_cache
 
 
-def test_a_folder_that_cannot_be_written_is_no_error(tmp_path, monkeypatch):
+def test_a_folder_that_cannot_be_written_is_a_warning(tmp_path, monkeypatch, capsys):
     (tmp_path / "file").touch()
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "file" / "below"))
     assert cache.enable() is None
+    warning = capsys.readouterr().err
+    assert warning.startswith("warning: no compilation cache")
+    assert warning.count("\n") == 1

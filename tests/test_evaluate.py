@@ -27,7 +27,10 @@ def scripted(spec, action):
         env_steps=0,
         params=None,
         initial=lambda n: jnp.zeros(n),
-        act=lambda key, carry, timestep: (carry, jnp.full((carry.shape[0], 1), action)),
+        apply=lambda params, key, carry, timestep: (
+            carry,
+            jnp.full((carry.shape[0], 1), action),
+        ),
     )
 
 
@@ -101,6 +104,16 @@ def test_a_loaded_policy_acts_like_the_agent_that_was_saved(saved):
     assert (loaded.config, loaded.spec, loaded.env_steps) == (tiny.CONFIG, env.spec, 0)
 
 
+def test_parameters_are_arguments_of_the_compiled_program(saved):
+    """So another checkpoint of the same shapes finds it in the compilation cache."""
+    env, key = tiny.env(), jax.random.key(0)
+    first = policy.load(saved[0])
+    second = policy.load(saved[0])
+    second = second._replace(params=jax.tree.map(lambda x: x + 1, second.params))
+    texts = [evaluate.player(env, p).lower(p.params, key).as_text() for p in (first, second)]
+    assert texts[0] == texts[1]
+
+
 def test_the_command_line_reports_each_simulation(saved, monkeypatch, capsys):
     asked = []
 
@@ -116,7 +129,26 @@ def test_the_command_line_reports_each_simulation(saved, monkeypatch, capsys):
     assert capsys.readouterr().out.count("2.0 +- 1.0 over 2 episodes") == 2
 
 
-def test_an_empty_folder_is_one_line_and_code_2(tmp_path, capsys, monkeypatch):
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--logdir", "."], "logdir='.': holds no checkpoint"),
+        ([], "--logdir=None: is required"),
+        (["--logdir", ".", "--physics", "mujok"], "--physics='mujok': did you mean 'mujoco'"),
+        (["--logdir", ".", "--episode", "3"], "--episode='3': no such flag; did you mean"),
+    ],
+)
+def test_bad_input_is_one_line_and_code_2(tmp_path, capsys, monkeypatch, flags, message):
+    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(evaluate.cache, "enable", lambda: None)
-    assert evaluate.guard(lambda: evaluate.main(["--logdir", str(tmp_path)])) == 2
-    assert capsys.readouterr().err.startswith("error: logdir=")
+    assert evaluate.guard(lambda: evaluate.main(flags)) == 2
+    output = capsys.readouterr()
+    assert output.err.startswith(f"error: {message}")
+    assert output.err.count("\n") == 1
+    assert not output.out
+
+
+@pytest.mark.parametrize("seed", [-1, 2**31])
+def test_an_impossible_seed_is_refused(seed):
+    with pytest.raises(InvalidInput, match="seed="):
+        evaluate.evaluate(scripted(CARTPOLE, 0.0), episodes=1, seed=seed)

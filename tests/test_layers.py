@@ -43,6 +43,7 @@ HOST = {
     "command_line",
     "display",
     "evaluate",
+    "flags",
     "manifest",
     "memory",
     "policy",

@@ -5,8 +5,10 @@ import jax.numpy as jnp
 import pytest
 import tiny
 
+from vawm import config as config_lib
 from vawm import memory, train
 from vawm.agent import make_agent
+from vawm.envs import probes
 from vawm.errors import InvalidInput
 from vawm.memory import Estimate
 
@@ -16,7 +18,9 @@ NEEDED = Estimate(
     params=100 * 2**20,
     optimizer=200 * 2**20,
     other_state=0,
-    working=700 * 2**20,
+    working=300 * 2**20,
+    process=400 * 2**20,
+    copies=1,
 )
 
 
@@ -52,6 +56,38 @@ def test_what_does_not_fit_is_refused_with_the_largest_replay_that_would():
         "replay.capacity=1000: needs 1.95 GiB, 1.46 GiB are free"
     )
     assert str(error.value).endswith("use replay.capacity=500 at most")
+
+
+@pytest.mark.parametrize("copies", [1, 2])
+def test_the_replay_that_is_named_fits_and_a_larger_one_does_not(copies):
+    needed = NEEDED._replace(copies=copies)
+    available = int(0.6 * needed.total)
+    with pytest.raises(InvalidInput) as error:
+        memory.check(needed, available)
+    largest = int(error.value.remedy.split("replay.capacity=")[1].split()[0])
+    for capacity, fits in [(largest, True), (largest + 1, False)]:
+        replay = needed.replay // needed.replay_capacity * capacity
+        total = needed._replace(replay=replay, replay_capacity=capacity).total
+        assert (total <= available) == fits
+
+
+def test_a_replay_too_small_to_learn_from_is_not_named():
+    memory.check(NEEDED, NEEDED.total, smallest=501)
+    with pytest.raises(InvalidInput, match="use a smaller size or batch"):
+        memory.check(NEEDED, 1500 * 2**20, smallest=501)
+
+
+def test_the_estimate_of_a_quick_run_is_not_below_what_was_measured(monkeypatch):
+    """2.47 GiB at the peak, on a CPU with 2 cores; not much above it either."""
+    monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
+    env = probes.make("observation_action", num_envs=config_lib.QUICK.num_envs)
+    spec = env.spec._replace(action_repeat=config_lib.QUICK.action_repeat)
+    env = env._replace(spec=spec)
+    agent = make_agent(config_lib.QUICK, spec)
+    state = jax.eval_shape(
+        lambda key: train.init(env, agent, config_lib.QUICK, key), jax.random.key(0)
+    )
+    assert 2.47 * 2**30 < memory.estimate(state, config_lib.QUICK).total < 3.5 * 2**30
 
 
 def test_a_model_that_does_not_fit_alone_is_not_blamed_on_replay():

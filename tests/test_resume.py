@@ -9,7 +9,7 @@ import pytest
 import tiny
 import toy
 
-from vawm import checkpoint, replay, resume
+from vawm import checkpoint, replay, resume, rundir
 from vawm.errors import InvalidInput
 from vawm.types import Latent, Trajectory
 
@@ -74,6 +74,20 @@ def test_another_choice_is_refused_by_name(saved, changes, field):
     with pytest.raises(InvalidInput, match="the checkpoint was trained with") as error:
         resume.check(saved, tiny.config(**changes))
     assert error.value.field == field
+
+
+def test_a_run_without_a_checkpoint_is_compared_with_how_it_was_started(tmp_path):
+    rundir.write_config(tmp_path, tiny.CONFIG)
+    resume.check(tmp_path, tiny.config(env_steps=10_000))
+    with pytest.raises(InvalidInput, match="seed=1: the run was started with 0"):
+        resume.check(tmp_path, tiny.config(seed=1))
+
+
+@pytest.mark.parametrize("content", ["", "[]", '{"config": {}}', '{"schema": 1}'])
+def test_a_folder_that_is_not_of_a_run_is_refused(tmp_path, content):
+    (tmp_path / rundir.CONFIG).write_text(content)
+    with pytest.raises(InvalidInput, match="holds no checkpoint"):
+        resume.check(tmp_path, tiny.CONFIG)
 
 
 def test_a_finished_run_is_not_continued(saved):

@@ -24,6 +24,11 @@ def test_a_folder_that_holds_something_is_refused(tmp_path):
         rundir.check_new(tmp_path)
 
 
+def test_a_folder_that_was_only_claimed_is_as_good_as_empty(tmp_path):
+    with rundir.claim(tmp_path):
+        rundir.check_new(tmp_path)
+
+
 @pytest.mark.parametrize("below", [".", "a", "a/b"])
 def test_a_path_through_a_file_is_refused(tmp_path, below):
     (tmp_path / "file").touch()
@@ -64,4 +69,13 @@ def test_the_config_is_written_with_the_version(tmp_path):
     rundir.write_config(tmp_path, tiny.CONFIG)
     content = json.loads((tmp_path / "config.json").read_text())
     assert content["vawm"] == manifest.version()
-    assert manifest.config_from_dict(content["config"]) == tiny.CONFIG
+    assert rundir.read_config(tmp_path) == tiny.CONFIG
+    assert rundir.read_config(tmp_path / "nowhere") is None
+
+
+def test_clearing_leaves_the_choices_and_strangers_alone(tmp_path):
+    rundir.write_config(tmp_path, tiny.CONFIG)
+    for name in ("metrics.jsonl", "events.out.tfevents.1.host", "notes.txt"):
+        (tmp_path / name).touch()
+    rundir.clear(tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["config.json", "notes.txt"]

@@ -120,6 +120,33 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_checkpoint(
     assert lines(tmp_path)[-1]["loss/critic"] is None
 
 
+def test_a_run_that_was_killed_before_its_first_checkpoint_starts_again(tmp_path, fake):
+    fake(lambda env_steps: math.nan if env_steps > 16 else 1.0)
+    with pytest.raises(runner.RunError, match="no checkpoint yet"):
+        run(tiny.CONFIG, tmp_path)
+    with pytest.raises(InvalidInput, match="exists; continue that run with --resume"):
+        run(tiny.CONFIG, tmp_path)
+    fake()
+    console = quiet()
+    assert run(tiny.CONFIG, tmp_path, resume=True, console=console).env_steps == 96
+    assert f"no checkpoint in {tmp_path} yet" in console.file.getvalue()
+    assert [line["env_steps"] for line in lines(tmp_path)] == [16, 32, 48, 64, 80, 96]
+    assert len(list(tmp_path.glob("events.out.tfevents.*"))) == 1
+
+
+def test_the_banner_comes_only_once_the_folder_is_claimed(tmp_path, fake, monkeypatch):
+    fake()
+    console = quiet()
+    run(tiny.CONFIG, tmp_path / "run", console=console, banner="who I am")
+    assert console.file.getvalue().startswith("who I am\n")
+    console = quiet()
+    monkeypatch.setattr(runner.rundir, "check_new", lambda _: None)
+    (tmp_path / "file").touch()
+    with pytest.raises(InvalidInput, match="is not writable"):
+        run(tiny.CONFIG, tmp_path / "file" / "run", console=console, banner="who I am")
+    assert not console.file.getvalue()
+
+
 def test_running_out_of_memory_is_explained(tmp_path, fake):
     def exhausted(_):
         raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: out of memory\nlong trace")

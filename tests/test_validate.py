@@ -62,6 +62,9 @@ def test_every_rule_is_about_a_field():
         ("env_steps", 31, "at least 32, what the first update needs"),
         ("collect_steps", 33, "at most 32"),
         ("seed", 2**32, "from 0 to 4294967295"),
+        ("replay.batch_length", 1, "at least 2"),
+        ("env_steps", 2**31, "below 2147483648"),
+        ("train_ratio", 2**31 // 8, "use 268435454 at most"),
     ],
 )
 def test_bad_values_come_with_a_remedy(name, value, remedy):
@@ -70,9 +73,32 @@ def test_bad_values_come_with_a_remedy(name, value, remedy):
     assert error.value.field == name
 
 
-@pytest.mark.parametrize(("name", "value"), [("replay.capacity", 32), ("env_steps", 32)])
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("replay.capacity", 32),
+        ("env_steps", 32),
+        ("train_ratio", 268435454),
+        ("seed", 2**32 - 1),
+    ],
+)
 def test_the_smallest_value_that_is_named_is_accepted(name, value):
     validate.check(changed(name, value))
+
+
+@pytest.mark.parametrize("preset", config_lib.PRESETS)
+def test_a_batch_larger_than_replay_is_blamed_and_a_smaller_one_named(preset):
+    config = config_lib.PRESETS[preset]
+    with pytest.raises(InvalidInput, match="does not fit into") as error:
+        validate.check(changed("replay.batch_size", 100_000, config))
+    assert error.value.field == "replay.batch_size"
+    largest = int(error.value.remedy.split()[-3])
+    validate.check(changed("replay.batch_size", largest, config))
+    with pytest.raises(InvalidInput):
+        validate.check(changed("replay.batch_size", largest + 1, config))
+    with pytest.raises(InvalidInput) as error:
+        validate.check(changed("replay.batch_length", 10**7, config))
+    assert error.value.field == "replay.batch_length"
 
 
 def test_unknown_presets_and_sizes_come_with_a_suggestion():

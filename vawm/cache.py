@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import pathlib
+import sys
 
 import jax
 
@@ -24,7 +25,7 @@ def folder() -> pathlib.Path:
 
 
 def enable() -> pathlib.Path | None:
-    """Turns the cache on; a folder that cannot be written leaves it off, never an error.
+    """Turns the cache on; a folder that cannot be written leaves it off, with a warning.
 
     Returns:
       The folder in use, or None where the cache is off.
@@ -35,9 +36,11 @@ def enable() -> pathlib.Path | None:
     try:
         path = folder()
         path.mkdir(parents=True, exist_ok=True)
-    except (OSError, RuntimeError):  # RuntimeError: no home to expand "~" to
-        return None
-    if not os.access(path, os.W_OK | os.X_OK):
+        if not os.access(path, os.W_OK | os.X_OK):
+            raise PermissionError(f"{path} is not writable")
+    except (OSError, RuntimeError) as error:  # RuntimeError: no home to expand "~" to
+        remedy = "set JAX_COMPILATION_CACHE_DIR to a folder that can be written"
+        print(f"warning: no compilation cache ({error}); {remedy}", file=sys.stderr)
         return None
     jax.config.update("jax_compilation_cache_dir", str(path))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", MIN_COMPILE_SECONDS)

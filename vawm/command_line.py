@@ -16,8 +16,9 @@ from typing import Annotated, NamedTuple
 
 import tyro
 
-from vawm import checkpoint, validate
 from vawm import config as config_lib
+from vawm import flags as flags_lib
+from vawm import resume, validate
 from vawm.checkpoint import SaveError
 from vawm.config import Config
 from vawm.errors import InvalidInput
@@ -47,28 +48,31 @@ def parse(argv: Sequence[str] | None, *, preset: str, description: str) -> Argum
     """Reads `argv` (of the process if None); `preset` is the default one.
 
     Raises:
-      InvalidInput: an unknown preset or size, or nothing to resume.
-      SystemExit: help was asked for (0), or a flag is unknown or of the wrong type (2).
+      InvalidInput: an unknown preset, size or flag, a wrong type, or nothing to resume.
+      SystemExit: help was asked for (0).
     """
     argv = list(sys.argv[1:] if argv is None else argv)
     default = Flags(_defaults(argv, preset))
-    flags = tyro.cli(Flags, args=argv, default=default, description=description)
+    flags = flags_lib.read(Flags, argv, default=default, description=description)
     return Arguments(flags.config, flags.logdir or default_logdir(flags.config), flags.resume)
 
 
 def _defaults(argv: list[str], preset: str) -> Config:
     """First phase: the config that the flags of the second override."""
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     parser.add_argument("--preset", nargs="?")
     parser.add_argument("--size", nargs="?")
     parser.add_argument("--logdir", nargs="?")
     parser.add_argument("--resume", action=argparse.BooleanOptionalAction)
-    known, _ = parser.parse_known_args(argv)
+    try:
+        known, _ = parser.parse_known_args(argv)
+    except argparse.ArgumentError:  # --resume=value
+        raise InvalidInput("--resume", True, "takes no value; write --resume alone") from None
     if not known.resume or {"-h", "--help"} & set(argv):
         return validate.preset(known.preset or preset, known.size)
     if known.logdir is None:
         raise InvalidInput("logdir", None, "--resume needs the --logdir of the run")
-    saved = checkpoint.read_manifest(known.logdir)[1].config
+    saved = resume.saved_config(known.logdir)
     if known.size not in (None, saved.size):
         validate.check_choice("size", known.size, config_lib.SIZES)
         return config_lib.with_size(saved, known.size)
@@ -89,17 +93,23 @@ def describe(config: Config) -> str:
         f"size {config.size}, seed {config.seed}"
     )
     unit = alignment.warmup_unit.replace("_", " ")
-    start = f"after {alignment.warmup_steps:,} {unit}"
+    warmup = f"{alignment.warmup_steps:,} {unit}"
+    paper = config_lib.PAPER
     if alignment.weight == "off":
         start = "off"
-    paper = config_lib.PAPER
+    elif alignment.warmup_unit == "env_steps" and alignment.warmup_steps >= config.env_steps:
+        start = f"never active in this run, which is not longer than its warm-up of {warmup}"
+    else:
+        start = f"after {warmup}"
+        if config.preset == "quick":
+            scale = f"{paper.value_alignment.warmup_steps:,} of {paper.env_steps:,}"
+            start += f", a warm-up scaled to the short run (paper: {scale})"
     if config.preset != "quick":
         return f"{head}\nvalue alignment: {start}"
     return (
         f"{head}\n"
         "  for a CPU with 2 cores and some minutes; this is not the paper's setting\n"
-        f"  value alignment: {start}, a warm-up scaled to the short run "
-        f"(paper: {paper.value_alignment.warmup_steps:,} of {paper.env_steps:,})\n"
+        f"  value alignment: {start}\n"
         f"  the paper's setting: --preset paper ({paper.env_steps:,} env steps, "
         f"size {paper.size}, better on a GPU)"
     )

@@ -18,9 +18,8 @@ from typing import Any, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tyro
 
-from vawm import cache, envs
+from vawm import cache, envs, flags, huge_pages
 from vawm import policy as policy_lib
 from vawm.command_line import guard
 from vawm.envs.protocol import Environment
@@ -83,17 +82,24 @@ def evaluate(
       env: in place of the MJX task; has `num_envs == episodes`.
 
     Raises:
-      InvalidInput: a number of episodes that is not positive.
+      InvalidInput: a number of episodes that is not positive, or an impossible seed.
     """
     if episodes < 1:
         raise InvalidInput("episodes", episodes, "use a number of at least 1")
+    if not 0 <= seed < 2**31:
+        raise InvalidInput("seed", seed, f"use a number from 0 to {2**31 - 1}")
     if physics == "mujoco":
         return _evaluate_mujoco(policy, episodes, seed)
     env = env or envs.make(
         policy.spec.task, num_envs=episodes, action_repeat=policy.spec.action_repeat
     )
-    returns = jax.jit(lambda key: play(env, policy, key))(jax.random.key(seed))
+    returns = player(env, policy)(policy.params, jax.random.key(seed))
     return Score(tuple(map(float, returns)))
+
+
+def player(env: Environment, policy: Policy) -> jax.stages.Wrapped:
+    """`(params, key) -> returns`, jitted: the same program for every checkpoint of a run."""
+    return jax.jit(lambda params, key: play(env, policy._replace(params=params), key))
 
 
 def play(env: Environment, policy: Policy, key: Array) -> Array:
@@ -183,7 +189,7 @@ class Arguments:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Prints a line per simulation; returns the exit code."""
-    arguments = tyro.cli(Arguments, args=argv)
+    arguments = flags.read(Arguments, argv, description=__doc__)
     cache.enable()
     policy = policy_lib.load(arguments.logdir)
     print(f"{policy.spec.task} at {policy.env_steps} env steps, mean +- standard error")
@@ -196,4 +202,5 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
+    huge_pages.use_huge_pages()
     sys.exit(guard(main))

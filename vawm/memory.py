@@ -25,11 +25,23 @@ CGROUP_LIMITS = [
     ),
 ]
 NO_LIMIT = 2**60  # bytes; control groups print a huge number for "none"
-COMPILER_BYTES = 400 * 2**20  # XLA's own needs while one update is compiled, measured
+PROCESS_BYTES = 2600 * 2**20
+"""On a CPU, what a run takes whatever its size: imports, XLA while it compiles, MJX.
+
+A `quick` run of cartpole peaks at 2.5 GiB (glibc's huge pages on), of which 0.1 are its
+state. Rounded up, since larger domains compile longer."""
+COMPILER_BYTES = 400 * 2**20  # of an accelerator's memory, for its context and programs
+WORKING_FACTOR = 4
+"""Measured per counted activation: 0.7 GB at size 1m for a batch of 16 x 64, 3.3 times
+what `working_bytes` counts; rounded up."""
 
 
 class Estimate(NamedTuple):
-    """Bytes that a run needs; `replay_capacity` is what `replay` holds, in steps."""
+    """Bytes that a run needs; `replay_capacity` is what `replay` holds, in steps.
+
+    `copies` of replay, parameters, optimiser and other state are in the same memory at
+    once: two where a checkpoint is written from, and read into, the memory of the run.
+    """
 
     replay: int
     replay_capacity: int
@@ -37,10 +49,16 @@ class Estimate(NamedTuple):
     optimizer: int
     other_state: int
     working: int
+    process: int
+    copies: int
+
+    @property
+    def state(self) -> int:
+        return self.replay + self.params + self.optimizer + self.other_state
 
     @property
     def total(self) -> int:
-        return self.replay + self.params + self.optimizer + self.other_state + self.working
+        return self.copies * self.state + self.working + self.process
 
     def __str__(self) -> str:
         parts = {
@@ -48,13 +66,15 @@ class Estimate(NamedTuple):
             "parameters": self.params,
             "optimiser": self.optimizer,
             "environments and the rest": self.other_state,
+            "a copy of these for checkpoints": (self.copies - 1) * self.state,
             "working memory": self.working,
+            "the process": self.process,
         }
-        return ", ".join(f"{name} {readable(size)}" for name, size in parts.items())
+        return ", ".join(f"{name} {readable(size)}" for name, size in parts.items() if size)
 
 
 def estimate(state: PyTree, config: Config) -> Estimate:
-    """What a run takes; exact for its state, a rule of thumb for working memory.
+    """What a run takes; exact for its state, on the high side for the rest.
 
     Args:
       state: the `TrainState`; shapes and dtypes are enough.
@@ -63,6 +83,7 @@ def estimate(state: PyTree, config: Config) -> Estimate:
     replay, params = nbytes(state.replay), nbytes(state.learner.params)
     optimizer = nbytes(state.learner.opt_state)
     num_envs, per_env = state.replay.trajectory.reward.shape
+    on_cpu = jax.default_backend() == "cpu"
     return Estimate(
         replay=replay,
         replay_capacity=num_envs * per_env,
@@ -70,6 +91,8 @@ def estimate(state: PyTree, config: Config) -> Estimate:
         optimizer=optimizer,
         other_state=nbytes(state) - replay - params - optimizer,
         working=working_bytes(config) + 2 * params,  # gradient and update
+        process=PROCESS_BYTES if on_cpu else COMPILER_BYTES,
+        copies=2 if on_cpu else 1,
     )
 
 
@@ -82,7 +105,7 @@ def working_bytes(config: Config) -> int:
     """Rule of thumb for the activations of one update, in bytes.
 
     Counts float32 numbers per replayed step (observe, forward and kept for backward) and
-    per imagined state (features, actor, critic and its logits), each a few times over.
+    per imagined state (features, actor, critic and its logits), `WORKING_FACTOR` times.
     """
     model, critic = config.world_model, config.critic
     feature = model.deter + model.stoch * model.classes
@@ -98,7 +121,7 @@ def working_bytes(config: Config) -> int:
     imagined = 2 * feature + config.actor.layers * config.actor.units + 4 * critic.bins
     steps = config.replay.batch_steps
     numbers = steps * (observed + (config.imagination.horizon + 1) * imagined)
-    return 4 * numbers + COMPILER_BYTES
+    return 4 * WORKING_FACTOR * numbers
 
 
 def available_bytes() -> int | None:
@@ -147,8 +170,13 @@ def _text(path: str) -> str:
         return ""
 
 
-def check(needed: Estimate, available: int | None) -> None:
+def check(needed: Estimate, available: int | None, *, smallest: int = 1) -> None:
     """Refuses a run that cannot fit, and names the replay that would.
+
+    Args:
+      needed: by the run.
+      available: free memory, None where that is not known.
+      smallest: steps in replay with which the run could still learn.
 
     Raises:
       InvalidInput: with the numbers.
@@ -156,9 +184,10 @@ def check(needed: Estimate, available: int | None) -> None:
     if available is None or needed.total <= available:
         return
     numbers = f"needs {readable(needed.total)}, {readable(available)} are free ({needed}); "
-    step = needed.replay / needed.replay_capacity
-    largest = int((available - (needed.total - needed.replay)) / step)
-    if largest < 1:
+    step = needed.copies * needed.replay / needed.replay_capacity
+    rest = needed.total - needed.copies * needed.replay
+    largest = int((available - rest) / step)
+    if largest < smallest:
         remedy = "no replay is small enough: use a smaller size or batch"
     else:
         remedy = f"use replay.capacity={largest} at most"

@@ -23,7 +23,7 @@ class Policy(NamedTuple):
       env_steps: when the checkpoint was written.
       params: the parameters.
       initial: `(batch_size) -> carry`, before the first observation.
-      act: `(key, carry, timestep) -> (carry, action [N, A])`, jitted; the action is raw.
+      apply: `(params, key, carry, timestep) -> (carry, action [N, A])`, jitted and pure.
     """
 
     config: Config
@@ -31,7 +31,13 @@ class Policy(NamedTuple):
     env_steps: int
     params: Params
     initial: Callable[[int], PolicyCarry]
-    act: Callable[[Key, PolicyCarry, TimeStep], tuple[PolicyCarry, Array]]
+    apply: Callable[[Params, Key, PolicyCarry, TimeStep], tuple[PolicyCarry, Array]]
+
+    def act(
+        self, key: Key, carry: PolicyCarry, timestep: TimeStep
+    ) -> tuple[PolicyCarry, Array]:
+        """The next carry and a raw action `[N, A]`, sampled as in training."""
+        return self.apply(self.params, key, carry, timestep)
 
 
 def load(logdir: str | os.PathLike[str]) -> Policy:
@@ -44,12 +50,11 @@ def load(logdir: str | os.PathLike[str]) -> Policy:
     agent = make_agent(manifest.config, manifest.spec)
     target = jax.eval_shape(agent.init, jax.random.key(0))
     params, manifest = checkpoint.restore_params(logdir, target)
-    act = jax.jit(agent.act)
     return Policy(
         config=manifest.config,
         spec=manifest.spec,
         env_steps=manifest.env_steps,
         params=params,
         initial=agent.initial,
-        act=lambda key, carry, timestep: act(params, key, carry, timestep),
+        apply=jax.jit(agent.act),
     )

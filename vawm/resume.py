@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
+import pathlib
 
 import jax
 import jax.numpy as jnp
 
-from vawm import checkpoint, validate
+from vawm import checkpoint, rundir, validate
 from vawm.config import Config
 from vawm.errors import InvalidInput
 from vawm.manifest import Manifest
@@ -17,22 +18,35 @@ from vawm.types import PyTree
 MAY_DIFFER = ("env_steps", "log_every", "save_every")
 
 
-def check(logdir: str | os.PathLike[str], config: Config) -> Manifest:
-    """Whether the newest checkpoint in `logdir` can be continued as `config`.
+def saved_config(logdir: str | os.PathLike[str]) -> Config:
+    """The choices of the run in `logdir`: of its newest checkpoint, or as it was started.
+
+    Raises:
+      InvalidInput: the folder is not that of a run, or its checkpoint is damaged.
+    """
+    if checkpoint.latest(logdir) is None:
+        started = rundir.read_config(pathlib.Path(logdir).expanduser())
+        if started is not None:
+            return started
+    return checkpoint.read_manifest(logdir)[1].config
+
+
+def check(logdir: str | os.PathLike[str], config: Config) -> None:
+    """Whether the run in `logdir` can be continued as `config`.
 
     Raises:
       InvalidInput: there is none, a choice differs, or there is nothing left to do.
     """
-    _, manifest = checkpoint.read_manifest(logdir)
-    saved = dict(validate.values(manifest.config))
+    saved = dict(validate.values(saved_config(logdir)))
+    path = checkpoint.latest(logdir)
+    whose = "the checkpoint was trained" if path else "the run was started"
     for name, value in validate.values(config):
         if name not in MAY_DIFFER and value != saved[name]:
-            remedy = f"the checkpoint was trained with {saved[name]!r}; use that to resume"
+            remedy = f"{whose} with {saved[name]!r}; use that to resume"
             raise InvalidInput(name, value, remedy)
-    if config.env_steps <= manifest.env_steps:
-        remedy = f"the checkpoint is at {manifest.env_steps} already; use more to continue it"
+    if path and config.env_steps <= (done := int(path.name)):
+        remedy = f"the checkpoint is at {done} already; use more to continue it"
         raise InvalidInput("env_steps", config.env_steps, remedy)
-    return manifest
 
 
 def restore(logdir: str | os.PathLike[str], shapes: PyTree) -> tuple[PyTree, Manifest]:

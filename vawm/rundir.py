@@ -15,7 +15,7 @@ from vawm import manifest as manifest_lib
 from vawm.config import Config
 from vawm.errors import InvalidInput
 
-LOCK = "lock"
+LOCK, CONFIG = "lock", "config.json"
 
 
 def check_new(logdir: pathlib.Path) -> None:
@@ -25,7 +25,7 @@ def check_new(logdir: pathlib.Path) -> None:
       InvalidInput: nothing was written.
     """
     check_writable(logdir)
-    if logdir.is_dir() and any(logdir.iterdir()):
+    if logdir.is_dir() and any(path.name != LOCK for path in logdir.iterdir()):
         remedy = "exists; continue that run with --resume or choose another --logdir"
         raise InvalidInput("logdir", str(logdir), remedy)
 
@@ -84,6 +84,28 @@ def write_config(logdir: pathlib.Path, config: Config) -> None:
         "vawm": manifest_lib.version(),
         "config": config_lib.as_dict(config),
     }
-    scratch = logdir / "config.json.tmp"
+    scratch = logdir / (CONFIG + ".tmp")
     scratch.write_text(json.dumps(content, indent=2) + "\n")
-    scratch.replace(logdir / "config.json")
+    scratch.replace(logdir / CONFIG)
+
+
+def read_config(logdir: pathlib.Path) -> Config | None:
+    """What `write_config` wrote into `logdir`; None where no run was started.
+
+    Raises:
+      InvalidInput: another version wrote it, with other fields.
+    """
+    try:
+        content = json.loads((logdir / CONFIG).read_text())
+    except (OSError, ValueError):
+        return None
+    if not isinstance(content, dict) or not {"schema", "vawm", "config"} <= content.keys():
+        return None
+    return manifest_lib.config_from_dict(content["config"])
+
+
+def clear(logdir: pathlib.Path) -> None:
+    """Removes what a run measured that saved nothing; it is about to measure it again."""
+    for pattern in ("metrics.jsonl*", "events.out.tfevents.*"):
+        for path in logdir.glob(pattern):
+            path.unlink()

@@ -80,6 +80,7 @@ def run(
     resume: bool = False,
     env: Environment | None = None,
     console: rich.console.Console | None = None,
+    banner: str = "",
     command: str = "the same command",
 ) -> Result:
     """Trains until `config.env_steps`, or until a signal asks for the end.
@@ -87,9 +88,11 @@ def run(
     Args:
       config: all choices of the run.
       logdir: a folder that is empty or not there yet; of the run to resume otherwise.
-      resume: continue from the newest checkpoint in `logdir`.
+      resume: continue from the newest checkpoint in `logdir`, or from the start where a
+        run was stopped before its first.
       env: an environment in place of the one that `config.task` names.
       console: where progress goes; standard output by default.
+      banner: printed once the run is known to start.
       command: how the caller was started, for the advice at the end.
 
     Raises:
@@ -102,11 +105,18 @@ def run(
     check(config, logdir, resume=resume, known_task=env is None)
     start = prepare(config, env)
     with rundir.claim(logdir), _out_of_memory_explained():
-        if resume:
+        if banner:
+            console.print(banner, highlight=False, soft_wrap=True, markup=False)
+        if resume and checkpoint.latest(logdir):
             state, progress = _continue(logdir, start)
+            rundir.write_config(logdir, config)
         else:
+            if resume:
+                rundir.clear(logdir)
+                text = f"no checkpoint in {logdir} yet: this run starts from the beginning"
+                console.print(text, highlight=False, soft_wrap=True, markup=False)
+            rundir.write_config(logdir, config)
             state, progress = start.init(jax.random.key(config.seed)), Progress()
-        rundir.write_config(logdir, config)
         result = _loop(config, logdir, start, state, progress, console)
     _summarise(config, result, console, command)
     return result
@@ -143,7 +153,11 @@ def prepare(config: Config, env: Environment | None = None) -> Start:
     agent = make_agent(config, env.spec)
     init = jax.jit(functools.partial(train.init, env, agent, config))
     shapes = init.eval_shape(jax.random.key(0))
-    memory.check(memory.estimate(shapes, config), memory.available_bytes())
+    memory.check(
+        memory.estimate(shapes, config),
+        memory.available_bytes(),
+        smallest=validate.smallest_replay(config),
+    )
     step = jax.jit(train.make_train_step(env, agent, config), donate_argnums=0)
     return Start(env, init, step, shapes)
 

@@ -23,6 +23,7 @@ BELOW_ONE: Rule = (lambda x: 0 <= x < 1, "use a number from 0 up to, not includi
 RATE: Rule = (lambda x: 0 < x <= 1, "use a number above 0 and up to 1")
 ABOVE_ONE: Rule = (lambda x: x > 1, "use a number above 1")
 BINS: Rule = (lambda x: x >= 3 and x % 2 == 1, "use an odd number of at least 3")
+SEQUENCE: Rule = (lambda x: x >= 2, "use a number of at least 2")
 CLASSES: Rule = (lambda x: 2 <= x <= 256, "use a number from 2 to 256")
 
 RULES: dict[str, Rule] = {
@@ -52,11 +53,14 @@ RULES: dict[str, Rule] = {
     "value_alignment.warmup_steps": NOT_NEGATIVE,
     "value_alignment.dynamics_scale": NOT_NEGATIVE,
     "value_alignment.representation_scale": NOT_NEGATIVE,
+    "replay.batch_length": SEQUENCE,
     "optimizer.warmup_updates": NOT_NEGATIVE,
     "optimizer.beta1": BELOW_ONE,
     "optimizer.beta2": BELOW_ONE,
 }
 """Every other number has to be positive."""
+
+INT32 = 2**31  # whole numbers are counted with on the device, all but the seed
 
 
 def check(config: Config) -> None:
@@ -108,11 +112,14 @@ def _check_number(name: str, value: Any, kind: type) -> None:
     holds, remedy = RULES.get(name, POSITIVE)
     if not holds(value):
         raise InvalidInput(name, value, remedy)
+    if kind is int and value >= INT32 and name != "seed":
+        raise InvalidInput(name, value, f"use a number below {INT32}")
 
 
 def _check_together(config: Config) -> None:
     _check_widths(config)
     _check_replay(config)
+    _check_counters(config)
     if EPISODE_STEPS % config.action_repeat:
         remedy = f"use a divisor of {EPISODE_STEPS}, the control steps of an episode"
         raise InvalidInput("action_repeat", config.action_repeat, remedy)
@@ -132,28 +139,75 @@ def _check_widths(config: Config) -> None:
         raise InvalidInput("world_model.deter", deter, remedy)
 
 
-def _check_replay(config: Config) -> None:
-    """Learning starts when replay holds as many sequences as a batch has steps."""
+def smallest_replay(config: Config) -> int:
+    """The least `replay.capacity` that can fill a batch and hold a chunk.
+
+    Learning starts when replay holds as many sequences as a batch has steps.
+    """
     replay = config.replay
-    batch_steps = replay.batch_steps
-    needed = replay.batch_length + -(-batch_steps // config.num_envs)  # in each environment
-    if replay.capacity // config.num_envs < needed:
-        remedy = (
-            f"use at least {needed * config.num_envs}, or smaller batches than "
-            f"{replay.batch_size} x {replay.batch_length}"
-        )
+    needed = replay.batch_length + -(-replay.batch_steps // config.num_envs)
+    return max(needed, config.collect_steps) * config.num_envs
+
+
+def _check_replay(config: Config) -> None:
+    """Replay can fill a batch, and the run lasts long enough for that."""
+    replay, num_envs = config.replay, config.num_envs
+    batches = f"smaller batches than {replay.batch_size} x {replay.batch_length}"
+    needed = replay.batch_length + -(-replay.batch_steps // num_envs)  # in each environment
+    needed_env_steps = needed * num_envs * config.action_repeat
+    fits = replay.capacity // num_envs >= needed
+    if not (fits and config.env_steps >= needed_env_steps):
+        _blame_batch(config)
+    if not fits:
+        remedy = f"use at least {needed * num_envs}, or {batches}"
         raise InvalidInput("replay.capacity", replay.capacity, remedy)
-    per_env = replay.capacity // config.num_envs
+    per_env = replay.capacity // num_envs
     if config.collect_steps > per_env:
         remedy = f"use at most {per_env}, replay.capacity / num_envs"
         raise InvalidInput("collect_steps", config.collect_steps, remedy)
-    needed_env_steps = needed * config.num_envs * config.action_repeat
     if config.env_steps < needed_env_steps:
         remedy = (
-            f"use at least {needed_env_steps}, what the first update needs in replay, or "
-            f"smaller batches than {replay.batch_size} x {replay.batch_length}"
+            f"use at least {needed_env_steps}, what the first update needs in replay, "
+            f"or {batches}"
         )
         raise InvalidInput("env_steps", config.env_steps, remedy)
+
+
+def _blame_batch(config: Config) -> None:
+    """Refuses a batch larger than the preset's for what replay gets to hold.
+
+    Raises:
+      InvalidInput: with the largest batch that would do; not for a batch of usual size.
+    """
+    replay, num_envs = config.replay, config.num_envs
+    usual = config_lib.PRESETS.get(config.preset, config_lib.PAPER).replay
+    if replay.batch_steps <= usual.batch_steps:
+        return
+    held = min(replay.capacity, config.env_steps // config.action_repeat) // num_envs
+    largest = (held - replay.batch_length) * num_envs // replay.batch_length
+    too_large = (
+        f"a batch of {replay.batch_size} x {replay.batch_length} does not fit into the "
+        f"{held * num_envs} steps that replay gets to hold"
+    )
+    if largest < 1:
+        remedy = f"{too_large}; use a smaller one"
+        raise InvalidInput("replay.batch_length", replay.batch_length, remedy)
+    raise InvalidInput(
+        "replay.batch_size", replay.batch_size, f"{too_large}; use {largest} at most"
+    )
+
+
+def _check_counters(config: Config) -> None:
+    """The replayed steps that are owed are an int32, and less than a batch is carried over."""
+    owed = config.collect_steps * config.num_envs
+    largest = (INT32 - config.replay.batch_steps) // owed
+    if config.train_ratio <= largest:
+        return
+    if largest >= 1:
+        remedy = f"use {largest} at most, or fewer collect_steps or num_envs"
+        raise InvalidInput("train_ratio", config.train_ratio, remedy)
+    remedy = f"use fewer: collect_steps * num_envs * train_ratio has to be below {INT32}"
+    raise InvalidInput("collect_steps", config.collect_steps, remedy)
 
 
 def preset(name: str, size: str | None = None) -> Config:

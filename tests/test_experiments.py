@@ -1,0 +1,128 @@
+"""The scripts beside the main experiment: bad input, and runs that are left to do."""
+
+import importlib.util
+import json
+import pathlib
+import sys
+
+import pytest
+import tiny
+import toy
+
+from vawm import checkpoint, command_line, rundir
+
+FOLDER = pathlib.Path(__file__).parents[1] / "experiments"
+
+
+def load(name):
+    spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # where dataclasses look their types up
+    spec.loader.exec_module(module)
+    return module
+
+
+benchmark, curves = load("benchmark"), load("learning_curves")
+
+
+@pytest.mark.parametrize(
+    ("module", "flags", "message"),
+    [
+        (benchmark, ["--size", "2m"], "size='2m': did you mean"),
+        (benchmark, ["--task", "walker_wlak"], "task='walker_wlak': did you mean"),
+        (benchmark, ["--num-envs", "0"], "num_envs=0: use a whole number of at least 1"),
+        (benchmark, ["--repeats", "0"], "repeats=0: use a whole number of at least 1"),
+        (benchmark, ["--batch-size", "2147483648"], "batch_size=2147483648: use a number"),
+        (benchmark, ["--compute-dtype", "float31"], "--compute-dtype='float31': did you"),
+        (benchmark, ["--batchsize", "3"], "--batchsize='3': no such flag"),
+        (curves, ["--tasks", "walker_wlak"], "task='walker_wlak': did you mean"),
+        (curves, ["--alignments", "of"], "alignments='of': did you mean 'off'"),
+        (curves, ["--preset", "quik"], "preset='quik': did you mean 'quick'"),
+        (curves, ["--jobs", "0"], "jobs=0: use a whole number"),
+        (curves, ["--env-steps", "0"], "env_steps=0: use a number above 0"),
+        (curves, ["--seeds", "a"], "--seeds='a': use a whole number"),
+    ],
+)
+def test_bad_input_is_one_line_and_code_2(
+    module, flags, message, capsys, monkeypatch, tmp_path
+):
+    monkeypatch.chdir(tmp_path)
+    assert command_line.guard(lambda: module.main(flags)) == 2
+    output = capsys.readouterr()
+    assert output.err.startswith(f"error: {message}")
+    assert output.err.count("\n") == 1
+    assert not output.out
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture
+def options(tmp_path):
+    return curves.Options(
+        tasks=("cartpole_balance",),
+        seeds=(0, 1, 2),
+        alignments=("off",),
+        runs=tmp_path / "runs",
+        results=tmp_path / "results",
+    )
+
+
+def saved(folder, env_steps):
+    folder.mkdir(parents=True, exist_ok=True)
+    rundir.write_config(folder, tiny.CONFIG)
+    if env_steps:
+        checkpoint.save(
+            folder,
+            toy.state(),
+            env_steps=env_steps,
+            config=tiny.CONFIG,
+            spec=toy.SPEC,
+            progress={},
+        )
+
+
+def test_finished_runs_are_skipped_and_started_ones_resumed(options, monkeypatch):
+    runs = curves.all_runs(options)
+    saved(runs[0].folder(options), 96)
+    saved(runs[1].folder(options), 0)
+    assert [run.finished(options) for run in runs] == [True, False, False]
+    assert ["--resume" in run.command(options) for run in runs] == [True, True, False]
+    longer = curves.dataclasses.replace(options, env_steps=97)
+    assert not runs[0].finished(longer)
+    command = runs[0].command(longer)
+    assert command[command.index("--env-steps") + 1] == "97"
+
+    started = []
+
+    def start(run, *_):
+        started.append(run)
+        script = f"raise SystemExit({run.seed - 1})"
+        return curves.subprocess.Popen([sys.executable, "-c", script])
+
+    monkeypatch.setattr(curves, "start", start)
+    assert curves.train(options) == {runs[2]: 1}
+    assert started == runs[1:]
+
+
+def test_a_run_that_failed_is_named_and_half_a_line_survived(options, monkeypatch, capsys):
+    run = curves.all_runs(options)[0]
+    saved(run.folder(options), 0)
+    line = {"env_steps": 8, "updates": 1, "time": 60.0, "episode/return": 12.34}
+    (run.folder(options) / "metrics.jsonl").write_text(json.dumps(line) + '\n{"env_st')
+    monkeypatch.setattr(curves, "train", lambda _: {run: 137})
+    flags = ["--tasks", *options.tasks, "--alignments", "off", "--seeds", "0"]
+    flags += ["--runs", str(options.runs), "--results", str(options.results)]
+    assert curves.main(flags) == 1
+    output = capsys.readouterr()
+    assert "last   12.3" in output.out
+    assert "exit code 137" in output.err
+    assert "seed=0" in output.err
+    assert (options.results / "curves.csv").read_text().count("\n") == 2
+    assert (options.results / "curves.png").stat().st_size
+
+
+def test_a_missing_matplotlib_is_told_before_anything_is_trained(options, monkeypatch, capsys):
+    monkeypatch.setattr(curves.importlib.util, "find_spec", lambda _: None)
+    monkeypatch.setattr(curves, "train", None)
+    flags = ["--runs", str(options.runs)]
+    assert command_line.guard(lambda: curves.main(flags)) == 1
+    assert "pip install matplotlib" in capsys.readouterr().err

@@ -1,0 +1,124 @@
+"""Flags from a dataclass, by tyro, with one line per error instead of its box."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import difflib
+import io
+import re
+import sys
+import typing
+from collections.abc import Sequence
+from typing import Any, TypeVar
+
+import tyro
+
+from vawm.errors import InvalidInput
+
+T = TypeVar("T")
+
+KINDS = {int: "a whole number", float: "a number"}
+
+
+def read(
+    cls: type[T],
+    argv: Sequence[str] | None = None,
+    *,
+    default: T | None = None,
+    description: str | None = None,
+) -> T:
+    """What `argv` (of the process if None) says, as a `cls`.
+
+    Raises:
+      InvalidInput: names the flag, its value and the remedy.
+      SystemExit: help was asked for (0).
+    """
+    argv = list(sys.argv[1:] if argv is None else argv)
+    given: Any = {} if default is None else {"default": default}
+    box = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(box):
+            result, unknown = tyro.cli(
+                cls, args=argv, description=description, return_unknown_args=True, **given
+            )
+    except SystemExit as error:
+        if not error.code:
+            raise
+        raise _bad_value(box.getvalue(), argv, known(cls)) from None
+    if unknown:
+        raise _unknown(unknown, known(cls))
+    return result
+
+
+def known(cls: type, prefix: str = "") -> dict[str, Any]:
+    """Flag -> type, for every field; those of `config: Config` have no prefix."""
+    hints = typing.get_type_hints(cls)
+    result: dict[str, Any] = {}
+    for field in dataclasses.fields(cls):
+        name, kind = prefix + field.name, hints[field.name]
+        if dataclasses.is_dataclass(kind):
+            result |= known(typing.cast(type, kind), "" if name == "config" else name + ".")
+        else:
+            result[_dashed("--" + name)] = kind
+    return result
+
+
+def choices(cls: type, name: str) -> tuple[str, ...]:
+    """What a field that is a `Literal` may be."""
+    return typing.get_args(typing.get_type_hints(cls)[name])
+
+
+def _dashed(flag: str) -> str:
+    """`--a.b_c_` as tyro writes it: `--a.b-c_`."""
+    return re.sub(r"(?<=\w)_(?=\w)", "-", flag)
+
+
+def _unknown(words: list[str], flags: dict[str, Any]) -> InvalidInput:
+    """The error for words that tyro could not place."""
+    first = next((word for word in words if word.startswith("-")), None)
+    if first is None:
+        remedy = "belongs to no flag; write --flag value (--help lists the flags)"
+        return InvalidInput("argument", words[0], remedy)
+    flag, values = first.partition("=")[0], _values(first.partition("=")[0], words)
+    close = difflib.get_close_matches(_dashed(flag), flags, n=1)
+    guess = f"did you mean {close[0]}? " if close else ""
+    value = " ".join(values) if values else None
+    return InvalidInput(flag, value, f"no such flag; {guess}--help lists all")
+
+
+def _bad_value(box: str, argv: list[str], flags: dict[str, Any]) -> InvalidInput:
+    """The error behind tyro's message, of which only the first flag is used."""
+    flag = next((name for name in re.findall(r"--[\w.-]*\w", box) if name in flags), None)
+    if flag is None:
+        text = " ".join(re.sub(r"[╭╮╰╯│─]", " ", box).split())
+        return InvalidInput("arguments", " ".join(argv), f"{text} (--help lists the flags)")
+    values, kind = _values(flag, argv), flags[flag]
+    if values is None:
+        return InvalidInput(flag, None, "is required (--help tells more)")
+    if not values:
+        return InvalidInput(flag, None, f"has no value; {_remedy(None, kind)}")
+    return InvalidInput(flag, " ".join(values), _remedy(values[0], kind))
+
+
+def _values(flag: str, words: list[str]) -> list[str] | None:
+    """The words that follow the last `flag`; None where it is not given."""
+    found = None
+    for i, word in enumerate(words):
+        name, has_value, value = word.partition("=")
+        if _dashed(name) == _dashed(flag):
+            end = i + 1
+            while end < len(words) and not words[end].startswith("--"):
+                end += 1
+            found = [value] if has_value else words[i + 1 : end]
+    return found
+
+
+def _remedy(value: str | None, kind: Any) -> str:
+    if typing.get_origin(kind) is typing.Literal:
+        names = [str(choice) for choice in typing.get_args(kind)]
+        close = difflib.get_close_matches(value or "", names, n=1)
+        guess = f"did you mean {close[0]!r}? " if close else ""
+        return f"{guess}use one of {', '.join(names)}"
+    wanted = [KINDS[k] for k in (kind, *typing.get_args(kind)) if k in KINDS]
+    return f"use {wanted[0]}" if wanted else "--help tells what it takes"
