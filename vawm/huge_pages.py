@@ -1,9 +1,10 @@
-"""Huge pages for the memory that updates on CPU work in.
+"""Huge pages for the memory that updates on CPU work in, kept from one update to the next.
 
 XLA's CPU backend takes the hundreds of megabytes of an update from malloc and gives them
-back after it, so every update faults all of them in again: at size 1m about 90,000 pages
-of 4 KiB, a quarter of its time. With pages of 2 MiB some 700 faults remain. glibc decides
-on its page size when a process starts, so a program has to start itself once more.
+back after it. By default glibc hands them on to the system, and every update faults all of
+them in again in pages of 4 KiB: at size 1m some 90,000 faults, a quarter of its time. With
+pages of 2 MiB that glibc keeps, hardly a fault is left. glibc reads its settings when a
+process starts, so a program has to start itself once more.
 """
 
 from __future__ import annotations
@@ -12,7 +13,14 @@ import os
 import pathlib
 import sys
 
-TUNABLE = "glibc.malloc.hugetlb"
+# Huge pages; every block from a heap, which is never trimmed; few heaps, as memory that
+# one of them keeps is lost to the others.
+TUNABLES = (
+    "glibc.malloc.hugetlb=1",
+    "glibc.malloc.mmap_max=0",
+    "glibc.malloc.trim_threshold=1000000000000",
+    "glibc.malloc.arena_max=4",
+)
 PAGE_SETTING = pathlib.Path("/sys/kernel/mm/transparent_hugepage/enabled")
 
 
@@ -20,14 +28,16 @@ def use_huge_pages() -> None:
     """Restart this program with glibc's huge pages on, unless they are or cannot be.
 
     For programs only, as their first act: the library never calls it. Does nothing
-    elsewhere than on Linux, where the system does not offer huge pages on request, or
-    under `VAWM_HUGE_PAGES=0`. The process keeps its id, its arguments and its terminal.
+    elsewhere than on Linux, where the system does not offer huge pages on request, where
+    `GLIBC_TUNABLES` already sets malloc, or under `VAWM_HUGE_PAGES=0`. The process keeps
+    its id, its arguments and its terminal.
     """
     tunables = os.environ.get("GLIBC_TUNABLES", "")
-    if TUNABLE in tunables or not offered() or os.environ.get("VAWM_HUGE_PAGES") == "0":
+    if "glibc.malloc." in tunables or not offered():
         return
-    setting = f"{TUNABLE}=1"
-    os.environ["GLIBC_TUNABLES"] = f"{tunables}:{setting}" if tunables else setting
+    if os.environ.get("VAWM_HUGE_PAGES") == "0":
+        return
+    os.environ["GLIBC_TUNABLES"] = ":".join([*filter(None, [tunables]), *TUNABLES])
     sys.stdout.flush()
     sys.stderr.flush()
     os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
