@@ -90,7 +90,7 @@ class ValueAlignmentConfig:
     weight: Literal["adaptive", "static", "off"] = "adaptive"
     """adaptive: 1 / max(1, KL), Eq. 5"""
     static_weight: float = 0.5
-    """used by weight="static"; Table 3"""
+    """used by weight="static", after the warm-up; Table 3"""
     warmup_steps: int = 10_000
     """weight 0 up to and including this step"""
     warmup_unit: Literal["env_steps", "updates"] = "env_steps"
