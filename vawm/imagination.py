@@ -24,8 +24,8 @@ def imagine(
     """Follow `policy` for `horizon` steps from N starts; no gradient leaves here.
 
     The scan emits the latent that each step starts from and runs once more than the
-    horizon: one more step of the core is cheaper than prepending the starts, which would
-    copy every imagined latent.
+    horizon, which spares the copy of every imagined latent that prepending the starts
+    would make.
 
     Args:
       world_model: the model that imagines.
