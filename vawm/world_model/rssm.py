@@ -14,6 +14,23 @@ from vawm.world_model.heads import flat_stoch, vector_heads
 from vawm.world_model.protocol import WorldModel
 
 
+def network(
+    config: WorldModelConfig, *, actions: int, tokens: int, dtype: jnp.dtype
+) -> nets.RSSM:
+    """The layers, for actions and tokens of these widths."""
+    return nets.RSSM(
+        deter=config.deter,
+        hidden=config.hidden,
+        stoch=config.stoch,
+        classes=config.classes,
+        action=actions,
+        tokens=tokens,
+        blocks=config.blocks,
+        prior_layers=config.prior_layers,
+        dtype=dtype,
+    )
+
+
 def rssm(
     config: WorldModelConfig,
     spec: EnvSpec,
@@ -37,17 +54,7 @@ def rssm(
         equal distributions then give equal samples).
     """
     heads = vector_heads(config, spec, dtype)
-    net = nets.RSSM(
-        deter=config.deter,
-        hidden=config.hidden,
-        stoch=config.stoch,
-        classes=config.classes,
-        action=spec.action_size,
-        tokens=heads.token_size,
-        blocks=config.blocks,
-        prior_layers=config.prior_layers,
-        dtype=dtype,
-    )
+    net = network(config, actions=spec.action_size, tokens=heads.token_size, dtype=dtype)
     stoch_shape = config.stoch, config.classes
 
     def apply(params: PyTree, method, *args):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Callable
 
 import chex
 import jax
@@ -38,12 +39,7 @@ def load(domain: str, name: str) -> tuple[Task, Physics]:
 def batch(
     task: Task, loaded: Physics, name: str, *, num_envs: int, action_repeat: int
 ) -> Environment:
-    """N environments of one task; see `Environment` for the stream's convention.
-
-    An ordinary step pays nothing for resets: they sit in a while loop that runs no
-    iteration while nobody is due, also when the whole step is vmapped over seeds (where
-    a `lax.cond` would become a select and run both sides).
-    """
+    """N environments of one task; see `Environment` for the stream's convention."""
     model, blank, host = loaded
     low, high = np.asarray(host.actuator_ctrlrange, np.float32).T
     spec = EnvSpec(
@@ -64,27 +60,6 @@ def batch(
         ctrl = rescale(action, low, high)
         return simulate(task, model, blank, data, target, ctrl, action_repeat=action_repeat)
 
-    def renew(state: EnvState, due: Array) -> EnvState:
-        """Starts a new episode where `due`; all keys move on when any does."""
-
-        def body(carry):
-            state, due, attempt = carry
-            key, key_begin = jax.vmap(lambda key: tuple(jax.random.split(key)))(state.key)
-            data, target = jax.vmap(begin)(key_begin)
-            state = EnvState(
-                data=select(due, data, state.data),
-                target=select(due, target, state.target),
-                steps=jnp.where(due, 0, state.steps),
-                key=key,
-            )
-            due = due & ~jax.vmap(physics.healthy)(data)  # draw those again
-            return state, due, attempt + 1
-
-        def anyone_due(carry):
-            return carry[1].any() & (carry[2] < MAX_DRAWS)
-
-        return jax.lax.while_loop(anyone_due, body, (state, due, jnp.int32(0)))[0]
-
     def observe(state: EnvState) -> Array:
         obs = jax.vmap(task.observe)(state.data, state.target)
         # The data is sound by induction; only a state edited from outside can be not.
@@ -99,7 +74,7 @@ def batch(
             key=jax.random.split(key, num_envs),
         )
         everyone = jnp.ones(num_envs, bool)
-        state = renew(empty, everyone)
+        state = renew(begin, empty, everyone)
         return state, TimeStep(
             obs=observe(state),
             reward=jnp.zeros(num_envs, jnp.float32),
@@ -120,7 +95,7 @@ def batch(
             steps=jnp.where(failed, -steps, steps),
             key=state.key,
         )
-        state = renew(state, due)
+        state = renew(begin, state, due)
         return state, TimeStep(
             obs=observe(state),
             reward=jnp.where(due | failed, 0.0, reward),
@@ -130,6 +105,40 @@ def batch(
         )
 
     return Environment(spec=spec, reset=reset, step=step)
+
+
+def renew(
+    begin: Callable[[Key], tuple[mjx.Data, Array]], state: EnvState, due: Array
+) -> EnvState:
+    """Starts a new episode where `due`; all keys move on when any does.
+
+    An ordinary step pays nothing for it: the loop runs no iteration while nobody is due,
+    also when the whole step is vmapped over seeds (where a `lax.cond` would become a
+    select and run both sides).
+
+    Args:
+      begin: draws the first state and the target of one environment.
+      state: of N environments.
+      due: `[N]` who starts anew.
+    """
+
+    def body(carry):
+        state, due, attempt = carry
+        key, key_begin = jax.vmap(lambda key: tuple(jax.random.split(key)))(state.key)
+        data, target = jax.vmap(begin)(key_begin)
+        state = EnvState(
+            data=select(due, data, state.data),
+            target=select(due, target, state.target),
+            steps=jnp.where(due, 0, state.steps),
+            key=key,
+        )
+        due = due & ~jax.vmap(physics.healthy)(data)  # draw those again
+        return state, due, attempt + 1
+
+    def anyone_due(carry):
+        return carry[1].any() & (carry[2] < MAX_DRAWS)
+
+    return jax.lax.while_loop(anyone_due, body, (state, due, jnp.int32(0)))[0]
 
 
 def simulate(
