@@ -1,9 +1,10 @@
 """The one loss that an update differentiates, in the order in which the data flows.
 
     1 explain the batch   2 maximum likelihood   3 value alignment      make_world_model_loss
-    4 imagine   5 returns and their scale   6 critic and actor             make_behaviour_loss
+    4 imagine   5 returns and their scale                                       make_foresight
+    6 critic and actor                                                     make_behaviour_loss
 
-Both are pure functions of the same `Params`; their sum is the loss of `vawm.train`.
+Losses are pure functions of the same `Params`; their sum is the loss of `vawm.train`.
 """
 
 from __future__ import annotations
@@ -142,36 +143,35 @@ def make_world_model_loss(agent: Agent, config: Config):
     return loss_fn
 
 
-def make_behaviour_loss(agent: Agent, config: Config):
-    """Eq. 7 and 8: critic and actor from imagination, critic from replay.
+class Foresight(NamedTuple):
+    """H imagined steps from every state of a batch, `[H, N, ...]`, and what they promise."""
 
-    Imagined latents carry no gradient; the replay value loss reaches the world model
-    unless `critic.replay_gradient` is off.
+    latent: Latent  # that the actions left from
+    action: Array  # [H, N, A]
+    value_logits: Array  # [H, N, bins] of the online critic, the only field with a gradient
+    returns: Array  # [H, N] lambda-returns, Eq. 7
+    advantage: Array  # [H, N] in units of the return scale, Eq. 8
+    weight: Array  # [H, N] probability, by the continue head, of getting there
+
+
+def make_foresight(agent: Agent, config: Config):
+    """Build `foresight(params, scale, batch, inference, key) -> (Foresight, scale, metrics)`.
+
+    Imagined latents carry no gradient, neither do the rewards, the continuation and the
+    values read from them.
     """
-    imagination, critic_config = config.imagination, config.critic
-    discount = 1.0 - 1.0 / imagination.discount_horizon
+    imagination = config.imagination
     reward_bins = transforms.symexp_bins(config.world_model.bins)
     actor, critic, world_model = agent.actor, agent.critic, agent.world_model
 
-    def critic_loss(logits: Array, slow_logits: Array, target: Array) -> Array:
-        return losses.critic_loss(
-            logits,
-            critic.mean(slow_logits),
-            target,
-            bins=critic.bins,
-            slow_scale=critic_config.slow_scale,
-        )
-
-    def loss_fn(
+    def foresight(
         params: Params,
-        slow_critic: PyTree,
         scale_state: returns.ReturnScale,
         batch: Batch,
         inference: Inference,
         key: Key,
-    ) -> tuple[Array, returns.ReturnScale, Metrics]:
+    ) -> tuple[Foresight, returns.ReturnScale, Metrics]:
         frozen = jax.lax.stop_gradient(params)
-        steps = jax.tree.map(lambda x: x[:, 1:], batch.trajectory)
         key_starts, key_imagine = jax.random.split(key)
         # 4. Imagine H steps from every state of the batch.
         carry, start = world_model.starts(
@@ -192,7 +192,6 @@ def make_behaviour_loss(agent: Agent, config: Config):
         cont = jax.nn.sigmoid(predictions.cont)
         logits = critic.logits(params.critic, imagined.latent)
         value = critic.mean(jax.lax.stop_gradient(logits))
-        weight = losses.discount_weights(cont)[:-1]
         target = returns.lambda_returns(
             reward[1:], cont[1:], value[1:], lambda_=imagination.lambda_
         )
@@ -204,52 +203,91 @@ def make_behaviour_loss(agent: Agent, config: Config):
             high=imagination.return_scale_high,
         )
         scale = returns.return_scale(scale_state, limit=imagination.return_scale_limit)
-        advantage = (target - value[:-1]) / scale
-        # 6. Critic and actor, Eq. 7 and 8; the critic also from replay.
-        before_last = jax.tree.map(lambda x: x[:-1], imagined.latent)
-        slow_logits = critic.logits(slow_critic, before_last)
-        policy = actor.policy(params.actor, before_last)
-        log_prob, entropy = policy.log_prob(imagined.action[:-1]), policy.entropy()
-        replay_latent = inference.latent
-        if not critic_config.replay_gradient:
-            replay_latent = jax.lax.stop_gradient(replay_latent)
-        replay_target = returns.replay_returns(
-            steps.reward,
-            steps.is_last,
-            steps.is_terminal,
-            target[0].reshape(steps.reward.shape),
-            discount=discount,
-            lambda_=imagination.lambda_,
-        )
-        replay_loss = critic_loss(
-            critic.logits(params.critic, replay_latent)[:, :-1],
-            critic.logits(slow_critic, jax.lax.stop_gradient(replay_latent))[:, :-1],
-            replay_target,
-        )
-        parts = {
-            "loss/actor": config.actor.scale
-            * weight
-            * losses.actor_loss(
-                log_prob,
-                entropy,
-                advantage,
-                entropy_scale=config.actor.entropy_scale,
-            ),
-            "loss/critic": critic_config.scale
-            * weight
-            * critic_loss(logits[:-1], slow_logits, target),
-            "loss/replay_critic": critic_config.replay_scale
-            * (1.0 - steps.is_last[:, :-1])
-            * replay_loss,
-        }
-        parts = {name: jnp.mean(part) for name, part in parts.items()}
-        metrics = parts | {
-            "policy/entropy": jnp.mean(entropy),
+        metrics = {
             "imagination/reward": jnp.mean(reward[1:]),
             "imagination/return": jnp.mean(target),
             "imagination/value": jnp.mean(value),
             "imagination/return_scale": scale,
         }
+        ahead = Foresight(
+            latent=jax.tree.map(lambda x: x[:-1], imagined.latent),
+            action=imagined.action[:-1],
+            value_logits=logits[:-1],
+            returns=target,
+            advantage=(target - value[:-1]) / scale,
+            weight=losses.discount_weights(cont)[:-1],
+        )
+        return ahead, scale_state, metrics
+
+    return foresight
+
+
+def make_behaviour_loss(agent: Agent, config: Config):
+    """Eq. 7 and 8: critic and actor from imagination, critic from replay.
+
+    Imagined latents carry no gradient; the replay value loss reaches the world model
+    unless `critic.replay_gradient` is off.
+    """
+    actor_config, critic_config = config.actor, config.critic
+    actor, critic = agent.actor, agent.critic
+    foresight = make_foresight(agent, config)
+
+    def critic_loss(logits: Array, slow_logits: Array, target: Array) -> Array:
+        return losses.critic_loss(
+            logits,
+            critic.mean(slow_logits),
+            target,
+            bins=critic.bins,
+            slow_scale=critic_config.slow_scale,
+        )
+
+    def replay_critic_loss(
+        params: Params, slow_critic: PyTree, steps: Trajectory, latent: Latent, bootstrap: Array
+    ) -> Array:
+        """Of the batch's own steps, `[B, T - 1]`, with imagined returns at the end."""
+        target = returns.replay_returns(
+            steps.reward,
+            steps.is_last,
+            steps.is_terminal,
+            bootstrap,
+            discount=1.0 - 1.0 / config.imagination.discount_horizon,
+            lambda_=config.imagination.lambda_,
+        )
+        if not critic_config.replay_gradient:
+            latent = jax.lax.stop_gradient(latent)
+        logits = critic.logits(params.critic, latent)[:, :-1]
+        slow_logits = critic.logits(slow_critic, jax.lax.stop_gradient(latent))[:, :-1]
+        return (1.0 - steps.is_last[:, :-1]) * critic_loss(logits, slow_logits, target)
+
+    def loss_fn(
+        params: Params,
+        slow_critic: PyTree,
+        scale_state: returns.ReturnScale,
+        batch: Batch,
+        inference: Inference,
+        key: Key,
+    ) -> tuple[Array, returns.ReturnScale, Metrics]:
+        ahead, scale_state, metrics = foresight(params, scale_state, batch, inference, key)
+        # 6. Critic and actor, Eq. 7 and 8; the critic also from replay.
+        policy = actor.policy(params.actor, ahead.latent)
+        log_prob, entropy = policy.log_prob(ahead.action), policy.entropy()
+        actor_loss = losses.actor_loss(
+            log_prob, entropy, ahead.advantage, entropy_scale=actor_config.entropy_scale
+        )
+        slow_logits = critic.logits(slow_critic, ahead.latent)
+        imagined_loss = critic_loss(ahead.value_logits, slow_logits, ahead.returns)
+        steps = jax.tree.map(lambda x: x[:, 1:], batch.trajectory)
+        bootstrap = ahead.returns[0].reshape(steps.reward.shape)
+        replayed_loss = replay_critic_loss(
+            params, slow_critic, steps, inference.latent, bootstrap
+        )
+        parts = {
+            "loss/actor": actor_config.scale * ahead.weight * actor_loss,
+            "loss/critic": critic_config.scale * ahead.weight * imagined_loss,
+            "loss/replay_critic": critic_config.replay_scale * replayed_loss,
+        }
+        parts = {name: jnp.mean(part) for name, part in parts.items()}
+        metrics = parts | metrics | {"policy/entropy": jnp.mean(entropy)}
         return total(parts), scale_state, metrics
 
     return loss_fn
