@@ -64,6 +64,7 @@ class TrainState(NamedTuple):
 
 
 Update = Callable[[Learner, Batch, Key, Array], tuple[Learner, Latent, Metrics]]
+Init = Callable[[Key], TrainState]
 Collect = Callable[[Params, Collector, Replay, Key], tuple[Collector, Replay, Metrics]]
 Learn = Callable[[Learner, Replay, Key, Array, Array], tuple[Learner, Replay, Metrics]]
 TrainStep = Callable[[TrainState], tuple[TrainState, Metrics]]
@@ -285,4 +286,26 @@ def init(env: Environment, agent: Agent, config: Config, key: Key) -> TrainState
         replay=replay.init(example, carry.latent, capacity=capacity),
         credit=jnp.zeros((), jnp.int32),
         key=key,
+    )
+
+
+SEED_AXES = TrainState(
+    learner=0,  # type: ignore[arg-type]
+    collector=0,  # type: ignore[arg-type]
+    replay=Replay(trajectory=0, latent=0, head=None, size=None),  # type: ignore[arg-type]
+    credit=None,  # type: ignore[arg-type]
+    key=0,  # type: ignore[arg-type]
+)
+"""Which leaves of a `TrainState` stack over seeds.
+
+How full replay is and what is owed follow from the number of chunks alone. Shared, they
+give the loop of updates one trip count; stacked, the loop would have to select between
+the old and the new replay of every seed after every update."""
+
+
+def over_seeds(init: Init, train_step: TrainStep) -> tuple[Init, TrainStep]:
+    """`init` over keys `[S]` and `train_step` over its states, all seeds side by side."""
+    return (
+        jax.vmap(init, out_axes=SEED_AXES),
+        jax.vmap(train_step, in_axes=(SEED_AXES,), out_axes=(SEED_AXES, 0)),
     )
