@@ -1,42 +1,102 @@
-"""A whole state with real physics, saved, restored, and played with."""
+"""A whole run on real physics: trained, resumed, evaluated, and used as the README says."""
+
+import math
+import pathlib
+import re
 
 import jax
+import jax.numpy as jnp
 import pytest
+import runs
 import tiny
-import toy
 
-from vawm import checkpoint, envs, evaluate, train
-from vawm.agent import make_agent
-from vawm.envs import EnvState
+from vawm import checkpoint, config, envs, evaluate, runner
 
-CONFIG = tiny.config(task="pendulum_swingup", action_repeat=20, env_steps=2000)
+CONFIG = tiny.config(
+    task="pendulum_swingup", action_repeat=20, env_steps=3000, log_every=320, save_every=960
+)  # 160 env steps per chunk; an episode ends at 2000
+README = pathlib.Path(__file__).parents[1] / "README.md"
+SNIPPETS = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
 
 
 @pytest.fixture(scope="module")
-def saved(tmp_path_factory):
-    """The folder of an untrained checkpoint, and its `TrainState`."""
-    env = envs.make(CONFIG.task, num_envs=CONFIG.num_envs, action_repeat=CONFIG.action_repeat)
-    agent = make_agent(CONFIG, env.spec)
-    state = jax.jit(lambda key: train.init(env, agent, CONFIG, key))(jax.random.key(0))
+def logdir(tmp_path_factory):
+    """The folder of an uninterrupted run."""
     logdir = tmp_path_factory.mktemp("pendulum")
-    checkpoint.save(logdir, state, env_steps=0, config=CONFIG, spec=env.spec, progress={})
-    return logdir, state
+    assert runner.run(CONFIG, logdir, console=runs.quiet()).exit_code == 0
+    return logdir
 
 
-def test_the_state_of_the_simulation_comes_back_bit_for_bit(saved):
-    logdir, state = saved
-    assert isinstance(state.collector.env_state, EnvState)
-    restored, manifest = checkpoint.restore(logdir, jax.eval_shape(lambda: state))
-    toy.assert_equal(restored, state)
+def test_the_simulation_is_part_of_the_checkpoint(logdir):
+    state, manifest = checkpoint.restore(logdir, runner.prepare(CONFIG).shapes)
+    assert isinstance(state.collector.env_state, envs.EnvState)
+    # Chunks of 4 calls: 19 make 3000 env steps of 2 environments, a reset among them.
+    assert state.collector.env_state.steps.tolist() == [500, 500]
     assert manifest.spec.task == CONFIG.task
 
 
-def test_both_simulations_report_whole_episodes(saved, capsys):
-    flags = ["--logdir", str(saved[0]), "--episodes", "2", "--physics", "mujoco"]
+def test_resuming_on_mjx_equals_a_run_in_one_piece(logdir, tmp_path):
+    first = tiny.dataclasses.replace(CONFIG, env_steps=1280)
+    runner.run(first, tmp_path, console=runs.quiet())
+    runner.run(CONFIG, tmp_path, resume=True, console=runs.quiet())
+    runs.assert_same(tmp_path, logdir, CONFIG)
+
+
+def test_both_simulations_report_whole_episodes(logdir, capsys):
+    flags = ["--logdir", str(logdir), "--episodes", "2", "--physics", "mujoco"]
     assert evaluate.main(flags) == 0
     title, *scores = capsys.readouterr().out.splitlines()
-    assert title.startswith("pendulum_swingup at 0 env steps")
+    assert title.startswith("pendulum_swingup at 3000 env steps")
     assert [score.split()[0] for score in scores] == ["mjx", "mujoco"]
     for score in scores:
         assert score.endswith("over 2 episodes")
         assert 0 <= float(score.split()[1]) <= 1000
+
+
+def snippet(name):
+    """The README's one block of Python that mentions `name`."""
+    (found,) = [text for text in SNIPPETS if name in text]
+    return found
+
+
+def test_the_readme_loads_a_checkpoint_and_acts(logdir, monkeypatch):
+    monkeypatch.chdir(logdir.parent)
+    names = {}
+    exec(snippet("vawm.load").replace("LOGDIR", logdir.name), names)
+    assert names["action"].shape == (4, 1)
+    assert jnp.isfinite(names["action"]).all()
+    assert names["timestep"].obs.shape == (4, 3)
+
+
+def test_the_readme_uses_the_losses():
+    prior = 0.6, 0.1, 0.1, 0.1, 0.1
+    names = {
+        "value_logits": jnp.zeros((2, 3, 5)),
+        "prior_value_logits": jnp.log(jnp.array([[prior]])) * jnp.ones((2, 3, 1)),
+        "latent_kl": jnp.full((2, 3), 4.0),
+        "env_steps": 20_000,
+    }
+    exec(snippet("vawm.losses"), names)
+    forward = sum(0.2 * math.log(0.2 / p) for p in prior)
+    assert jnp.allclose(names["loss"], 0.6 * forward, atol=1e-6)
+    assert (names["weight"] == 0.25).all()
+
+
+def test_the_readme_makes_environments():
+    names = {}
+    exec(snippet("gymnasium.make_vec"), names)
+    assert names["env"].spec.num_envs == 64
+    assert names["gym_env"].num_envs == 64
+
+
+def test_the_readme_stacks_seeds(monkeypatch):
+    monkeypatch.setattr(config, "QUICK", tiny.CONFIG)
+    monkeypatch.setattr(envs, "make", lambda *_, **__: tiny.env())
+    names = {}
+    with jax.debug_key_reuse(False):  # it takes a slice of a batch of keys for all of them
+        exec(snippet("over_seeds"), names)
+    assert names["metrics"]["env_steps"].tolist() == [8] * 8
+
+
+def test_every_snippet_of_the_readme_is_run_here():
+    assert len(SNIPPETS) == 4

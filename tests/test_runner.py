@@ -12,12 +12,13 @@ import pytest
 import rich.console
 import tiny
 import toy
+from runs import assert_same, lines, quiet
 
-from vawm import checkpoint, envs, memory, runner, tracking
+from vawm import checkpoint, envs, memory, runner
 from vawm.envs import Environment
 from vawm.errors import InvalidInput
 
-WALL_TIME = ("time", "env_steps_per_s", "updates_per_s")
+LONG = tiny.config(env_steps=192)
 
 
 class SignalAt(io.StringIO):
@@ -70,23 +71,8 @@ def fake(monkeypatch):
     return install
 
 
-def quiet():
-    return rich.console.Console(file=io.StringIO())
-
-
 def run(config, logdir, **changes):
     return runner.run(config, logdir, **{"env": tiny.env(), "console": quiet()} | changes)
-
-
-def lines(logdir):
-    return tracking.read(logdir / "metrics.jsonl")
-
-
-def measured(logdir):
-    return [
-        {name: value for name, value in line.items() if name not in WALL_TIME}
-        for line in lines(logdir)
-    ]
 
 
 def test_a_line_closes_each_interval_and_the_run(tmp_path, fake):
@@ -181,16 +167,8 @@ def test_every_task_can_be_named(tmp_path):
 def uninterrupted(tmp_path_factory):
     """A folder with a whole run of `tiny.CONFIG`, twice as long."""
     logdir = tmp_path_factory.mktemp("uninterrupted")
-    run(tiny.config(env_steps=192), logdir)
+    run(LONG, logdir)
     return logdir
-
-
-def assert_same_run(actual, expected):
-    shapes = runner.prepare(tiny.config(env_steps=192), tiny.env()).shapes
-    restored = [checkpoint.restore(logdir, shapes) for logdir in (actual, expected)]
-    toy.assert_equal(restored[0][0], restored[1][0])
-    assert [saved.env_steps for _, saved in restored] == [192, 192]
-    assert measured(actual) == measured(expected)
 
 
 def test_a_line_reports_what_was_promised(uninterrupted):
@@ -206,19 +184,19 @@ def test_a_line_reports_what_was_promised(uninterrupted):
 def test_k_steps_and_the_rest_equal_a_run_in_one_piece(tmp_path, uninterrupted, env_steps):
     """104 is not a multiple of `log_every`: its last line is written and dropped again."""
     run(tiny.config(env_steps=env_steps), tmp_path)
-    run(tiny.config(env_steps=192), tmp_path, resume=True)
-    assert_same_run(tmp_path, uninterrupted)
+    run(LONG, tmp_path, resume=True)
+    assert_same(tmp_path, uninterrupted, LONG, tiny.env())
 
 
 def test_a_run_that_a_signal_stopped_goes_on_as_if_nothing_had_happened(
     tmp_path, uninterrupted
 ):
     console = rich.console.Console(file=SignalAt("env_steps 84/"), width=200)
-    result = run(tiny.config(env_steps=192), tmp_path, console=console)
+    result = run(LONG, tmp_path, console=console)
     assert result.exit_code == 130
     assert 84 <= result.env_steps < 192
     assert "resume with: the same command --resume" in console.file.getvalue()
     with (tmp_path / "metrics.jsonl").open("a") as file:
         file.write('{"env_steps": 10000}\n{"half a line')
-    run(tiny.config(env_steps=192), tmp_path, resume=True)
-    assert_same_run(tmp_path, uninterrupted)
+    run(LONG, tmp_path, resume=True)
+    assert_same(tmp_path, uninterrupted, LONG, tiny.env())

@@ -1,0 +1,37 @@
+"""Runs on disk, and what two of them must have in common."""
+
+import io
+
+import rich.console
+import toy
+
+from vawm import checkpoint, runner, tracking
+
+WALL_TIME = ("time", "env_steps_per_s", "updates_per_s")
+
+
+def quiet():
+    return rich.console.Console(file=io.StringIO())
+
+
+def lines(logdir):
+    return tracking.read(logdir / "metrics.jsonl")
+
+
+def measured(logdir):
+    """The lines of metrics without what a clock put there."""
+    return [
+        {name: value for name, value in line.items() if name not in WALL_TIME}
+        for line in lines(logdir)
+    ]
+
+
+def assert_same(actual, expected, config, env=None):
+    """Two whole runs of `config`: the same state bit for bit, the same lines."""
+    shapes = runner.prepare(config, env).shapes
+    (state, manifest), (other, other_manifest) = (
+        checkpoint.restore(logdir, shapes) for logdir in (actual, expected)
+    )
+    toy.assert_equal(state, other)
+    assert manifest.env_steps == other_manifest.env_steps == config.env_steps
+    assert measured(actual) == measured(expected)
