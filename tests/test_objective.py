@@ -66,7 +66,7 @@ def alignment_gradient(alignment):
             train=True,
         )
         kl = jnp.ones((BATCH, LENGTH))
-        aligned, weight = value_alignment(params.critic, inference, kl, jnp.asarray(1))
+        aligned, weight, _ = value_alignment(params.critic, inference, kl, jnp.asarray(1))
         return jnp.mean(aligned * weight), aligned
 
     return jax.jit(jax.grad(loss, has_aux=True))
@@ -135,7 +135,7 @@ def test_the_weight_is_gated_by_the_warmup_and_follows_its_mode(alignment, step,
     logits = jnp.zeros((*shape, 4, 4))
     inference = Inference(*latents, logits, logits, jnp.ones(shape, bool).at[0, 0].set(False))
     value_alignment = jax.jit(objective.make_value_alignment(agent, config))
-    aligned, weight = value_alignment(
+    aligned, weight, _ = value_alignment(
         params().critic, inference, jnp.full(shape, 3.0), jnp.asarray(step)
     )
     assert weight[0, 0] == aligned[0, 0] == 0.0  # a state that nothing predicted
@@ -225,3 +225,23 @@ def test_shared_noise_gives_no_loss_where_prior_equals_posterior():
         return metrics["value_alignment/loss"]
 
     assert aligned(params()) == 0.0
+
+
+def test_what_is_logged_does_not_depend_on_scales_or_weight():
+    """KL of values and entropies of latents, comparable between all ablations."""
+    scaled = dataclasses.replace(ON, dynamics_scale=2.0, representation_scale=1.0)
+    off = dataclasses.replace(ON, weight="off")
+    lines = []
+    for alignment in (ON, scaled, off):
+        agent, config = make(alignment)
+        loss = objective.make_world_model_loss(agent, config)
+        args = params(), params().critic, batch(agent), jax.random.key(1), jnp.asarray(1)
+        lines.append(jax.jit(loss)(*args)[2])
+    first = lines[0]
+    ratio = first["value_alignment/loss"] / first["value_alignment/kl"]
+    np.testing.assert_allclose(ratio, ON.dynamics_scale + ON.representation_scale, rtol=1e-5)
+    for name in ("value_alignment/kl", "latent/posterior_entropy", "latent/prior_entropy"):
+        assert first[name] > 0
+        np.testing.assert_allclose([line[name] for line in lines[1:]], first[name], rtol=1e-5)
+    largest = tiny.CONFIG.world_model.stoch * np.log(tiny.CONFIG.world_model.classes)
+    assert first["latent/prior_entropy"] < largest

@@ -280,3 +280,14 @@ def test_categorical_kl_of_equal_logits_is_exactly_zero():
 def test_categorical_kl_refuses_shapes_that_would_broadcast():
     with pytest.raises(AssertionError):
         transforms.categorical_kl(jnp.zeros((6, 5)), jnp.zeros((1, 5)))
+
+
+def test_categorical_entropy_matches_its_sum_and_is_known_at_the_ends():
+    logits = 3 * jax.random.normal(jax.random.key(0), (6, 5))
+    log_prob = slow_log_softmax(logits)
+    twin = -(np.exp(log_prob) * log_prob).sum(-1)
+    np.testing.assert_allclose(transforms.categorical_entropy(logits), twin, rtol=1e-5)
+    ends = jnp.array([[0.0, 0.0, 0.0, 0.0], [1e4, 0.0, 0.0, 0.0]])
+    np.testing.assert_allclose(
+        transforms.categorical_entropy(ends), [np.log(4), 0.0], rtol=1e-6, atol=1e-7
+    )

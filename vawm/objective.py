@@ -34,12 +34,19 @@ def total(parts: Metrics) -> Array:
     return jnp.sum(jnp.stack(list(parts.values())))
 
 
-def make_value_alignment(agent: Agent, config: Config) -> Callable[..., tuple[Array, Array]]:
-    """Build `value_alignment(critic_params, inference, latent_kl, step) -> (loss, weight)`.
+class Alignment(NamedTuple):
+    """L_var at every state of a batch, `[B, T]`; 0 where nothing was predicted."""
 
-    L_var of Eq. 4 and its weight of Eq. 5 at every state of a batch, both `[B, T]`. The
-    critic's parameters are stopped and the same for both latents; gradients reach the world
-    model through the latents, or only through z where `deter_gradient` is "stop".
+    loss: Array  # Eq. 4, both terms with their scales
+    weight: Array  # Eq. 5
+    kl: Array  # KL[V(s) || V(s~)] in nats, whatever the scales; no gradient
+
+
+def make_value_alignment(agent: Agent, config: Config) -> Callable[..., Alignment]:
+    """Build `value_alignment(critic_params, inference, latent_kl, step) -> Alignment`.
+
+    The critic's parameters are stopped and the same for both latents; gradients reach the
+    world model through the latents, or only through z where `deter_gradient` is "stop".
     """
     alignment = config.value_alignment
 
@@ -53,7 +60,7 @@ def make_value_alignment(agent: Agent, config: Config) -> Callable[..., tuple[Ar
 
     def value_alignment(
         critic: PyTree, inference: Inference, kl: Array, step: Array
-    ) -> tuple[Array, Array]:
+    ) -> Alignment:
         critic = jax.lax.stop_gradient(critic)
         if alignment.weight == "off":  # no backward pass either
             inference = jax.lax.stop_gradient(inference)
@@ -62,13 +69,17 @@ def make_value_alignment(agent: Agent, config: Config) -> Callable[..., tuple[Ar
             deter = jax.lax.stop_gradient(latent.deter)
             latent = latent._replace(deter=deter)
             prior_latent = prior_latent._replace(deter=deter)
+        logits = agent.critic.logits(critic, latent)
+        prior_logits = agent.critic.logits(critic, prior_latent)
         loss = losses.value_alignment_loss(
-            agent.critic.logits(critic, latent),
-            agent.critic.logits(critic, prior_latent),
+            logits,
+            prior_logits,
             dynamics_scale=alignment.dynamics_scale,
             representation_scale=alignment.representation_scale,
         )
-        return loss * inference.has_prior, weight_of(kl, step) * inference.has_prior
+        value_kl = transforms.categorical_kl(*jax.lax.stop_gradient((logits, prior_logits)))
+        parts = Alignment(loss, weight_of(kl, step), value_kl)
+        return jax.tree.map(lambda part: part * inference.has_prior, parts)
 
     return value_alignment
 
@@ -82,6 +93,11 @@ def make_world_model_loss(agent: Agent, config: Config):
     value_alignment = make_value_alignment(agent, config)
     reward_bins = transforms.symexp_bins(model.bins)
     discount = 1.0 - 1.0 / config.imagination.discount_horizon
+
+    def entropy(logits: Array) -> Array:
+        """Of z_t, in nats, summed over its categoricals."""
+        mixed = transforms.unimix_logits(logits, model.unimix)
+        return transforms.categorical_entropy(jax.lax.stop_gradient(mixed)).sum(-1)
 
     def loss_fn(
         params: Params, slow_critic: PyTree, batch: Batch, key: Key, step: Array
@@ -121,7 +137,7 @@ def make_world_model_loss(agent: Agent, config: Config):
         # 3. Value alignment, Eq. 4 and 5.
         slow = config.value_alignment.critic == "slow"
         critic = slow_critic if slow else params.critic
-        aligned, weight = value_alignment(critic, inference, kl, step)
+        aligned = value_alignment(critic, inference, kl, step)
         parts = {
             "loss/reconstruction": model.reconstruction_scale * prediction.reconstruction,
             "loss/reward": prediction.reward,
@@ -129,14 +145,17 @@ def make_world_model_loss(agent: Agent, config: Config):
             "loss/dynamics": dynamics,
         }
         parts = {name: jnp.mean(part) for name, part in parts.items()}
-        loss_var = {"loss/value_alignment": jnp.mean(weight * aligned)}
+        loss_var = {"loss/value_alignment": jnp.mean(aligned.weight * aligned.loss)}
         if config.value_alignment.weight != "off":
             parts |= loss_var
         metrics = parts | loss_var
         metrics |= {
-            "value_alignment/loss": jnp.mean(aligned),
-            "value_alignment/weight": jnp.mean(weight),
+            "value_alignment/loss": jnp.mean(aligned.loss),
+            "value_alignment/weight": jnp.mean(aligned.weight),
+            "value_alignment/kl": jnp.mean(aligned.kl),
             "latent/kl": jnp.mean(kl),
+            "latent/posterior_entropy": jnp.mean(entropy(inference.post_logits)),
+            "latent/prior_entropy": jnp.mean(entropy(inference.prior_logits)),
         }
         return total(parts), inference, metrics
 

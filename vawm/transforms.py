@@ -128,6 +128,12 @@ def categorical_kl(p_logits: Array, q_logits: Array) -> Array:
     return (jnp.exp(log_p) * (log_p - log_q)).sum(-1)
 
 
+def categorical_entropy(logits: Array) -> Array:
+    """Entropy of softmax(logits) in nats, over the last axis."""
+    log_prob = jax.nn.log_softmax(logits.astype(jnp.float32))
+    return -(jnp.exp(log_prob) * log_prob).sum(-1)
+
+
 def _neighbours(y: Array, bins: Array) -> tuple[Array, Array, Array]:
     """Indices of the bins below and above `y`, and the weight of the one above."""
     # Clipping keeps NaN, which the weight then carries: a broken target is not hidden.
