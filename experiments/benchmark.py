@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import resource
 import statistics
 import sys
@@ -41,7 +42,7 @@ class Benchmark:
     batch_length: int = 64
     observations: int = 24
     actions: int = 6
-    repeats: int = 8
+    repeats: int = 16
     """timed updates of each kind"""
     compute_dtype: Literal["auto", "float32", "bfloat16"] = "auto"
     task: str = "cartpole_swingup"
@@ -139,6 +140,14 @@ def env_steps_per_s(options: Benchmark, config: Config) -> float:
     return options.num_envs * options.env_calls / statistics.median(seconds[1:])
 
 
+def quartiles(values: Sequence[float]) -> list[float]:
+    """The first and the third; both the value itself where there is only one."""
+    if len(values) == 1:
+        return [values[0], values[0]]
+    first, _, third = statistics.quantiles(values, n=4, method="inclusive")
+    return [first, third]
+
+
 def run(options: Benchmark) -> dict:
     config = make_config(options)
     spec = EnvSpec(
@@ -160,16 +169,19 @@ def run(options: Benchmark) -> dict:
     for _ in range(options.repeats):
         on.run()
         off.run()
-    overhead = statistics.median(a / b for a, b in zip(on.seconds, off.seconds, strict=True))
+    overheads = [100 * (a / b - 1) for a, b in zip(on.seconds, off.seconds, strict=True)]
     return {
         "size": options.size,
         "params": parameter_count(on.learner.params),
         "device": jax.devices()[0].device_kind,
+        "cores": os.cpu_count(),
+        "jax": jax.__version__,
         "batch": [options.batch_size, options.batch_length],
         "update_s_median": statistics.median(on.seconds),
         "update_s_min": min(on.seconds),
         "update_s_median_off": statistics.median(off.seconds),
-        "overhead_percent": 100 * (overhead - 1),
+        "overhead_percent": statistics.median(overheads),
+        "overhead_percent_quartiles": quartiles(overheads),
         "compile_s": on.compile_seconds,
         "peak_rss_gb": peak_rss_gb,
         "env_steps_per_s": env_steps_per_s(options, config),
