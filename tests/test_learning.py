@@ -92,6 +92,7 @@ RUNGS = [
     ("observation_action", 1000, 0.5),
     ("observation_action_discrete", 600, 0.25),
     ("memory_discrete", 1200, 0.25),
+    ("memory", 2400, 0.3),
 ]
 
 
