@@ -1,5 +1,6 @@
 """Flags, defaults in two phases, and one line for every kind of bad input."""
 
+import dataclasses
 import importlib.util
 import pathlib
 
@@ -16,6 +17,15 @@ EXPERIMENT = pathlib.Path(__file__).parents[1] / "experiments" / "dmc_proprio.py
 
 def parse(*flags):
     return command_line.parse(flags, preset="quick", description="")
+
+
+UNUSUAL = config_lib.with_size(tiny.config(task="walker_run", preset="quick", seed=7), "1m")
+
+
+def save(logdir, config):
+    checkpoint.save(
+        logdir, toy.state(), env_steps=48, config=config, spec=toy.SPEC, progress={}
+    )
 
 
 @pytest.fixture
@@ -39,11 +49,8 @@ def experiment(monkeypatch, tmp_path):
 def saved(tmp_path):
     """The folder of a run with unusual choices."""
     logdir = tmp_path / "saved"
-    config = tiny.config(task="walker_run", preset="quick", size="1m", seed=7)
-    checkpoint.save(
-        logdir, toy.state(), env_steps=48, config=config, spec=toy.SPEC, progress={}
-    )
-    return logdir, config
+    save(logdir, UNUSUAL)
+    return logdir, UNUSUAL
 
 
 def test_the_defaults_are_the_preset():
@@ -120,7 +127,8 @@ def test_the_preset_says_what_it_is(experiment, capsys):
     assert f"preset quick: {quick.task}, {quick.env_steps:,} env steps, size 1m" in text
     assert "not the paper's setting" in text
     warmup = quick.value_alignment.warmup_steps
-    assert f"value alignment: after {warmup:,} env steps, a warm-up scaled" in text
+    assert f"value alignment: active after {warmup:,} env steps, for 94 % of the run" in text
+    assert "the warm-up is scaled to the short run (paper: 10,000 of 500,000)" in text
     assert "--preset paper" in text
 
 
@@ -133,26 +141,84 @@ def test_value_alignment_that_is_off_is_called_off(preset):
     assert "warm-up" not in text
 
 
-def test_a_warm_up_as_long_as_the_run_is_told():
-    warmup = config_lib.QUICK.value_alignment.warmup_steps
-    assert "never active" in command_line.describe(parse("--env-steps", str(warmup)).config)
-    longer = command_line.describe(parse("--env-steps", str(warmup + 1)).config)
-    assert "never active" not in longer
+@pytest.mark.parametrize("flag", [["--env-steps", "240000"], ["--env_steps=240000"]])
+def test_the_warm_up_of_quick_keeps_its_share_of_another_length(flag):
+    alignment = parse(*flag).config.value_alignment
+    assert alignment == dataclasses.replace(
+        config_lib.QUICK.value_alignment, warmup_steps=2 * 7_200
+    )
+    given = parse(*flag, "--value-alignment.warmup-steps", "5").config
+    assert given.value_alignment.warmup_steps == 5
+    paper = parse(*flag, "--preset", "paper").config
+    assert paper.value_alignment == config_lib.PAPER.value_alignment
+
+
+def test_the_warm_up_of_a_saved_run_stays_when_it_is_extended(saved):
+    flags = "--resume", "--logdir", str(saved[0]), "--env-steps", "10000"
+    assert parse(*flags).config.value_alignment == UNUSUAL.value_alignment
+
+
+WARMUP, UPDATES = "--value-alignment.warmup-steps", "--value-alignment.warmup-unit=updates"
+
+
+@pytest.mark.parametrize(
+    ("flags", "expected"),
+    [
+        ([], "active after 7,200 env steps, for 94 % of the run; the warm-up is scaled"),
+        (["--env-steps=5000"], "active after 300 env steps, for 94 % of the run; the warm-up"),
+        (["--env-steps=500000"], "active after 30,000 env steps, for 94 % of the run\n"),
+        ([WARMUP, "60000"], "active after 60,000 env steps, for 50 % of the run\n"),
+        ([WARMUP, "119999"], "active after 119,999 env steps, for less than 1 % of the run\n"),
+        ([WARMUP, "120000"], "never active in this run of 120,000 env steps, whose warm-up is"),
+        ([UPDATES, WARMUP, "3686"], "active after 3,686 updates, for about 50 % of the run\n"),
+        ([UPDATES], "active after 7,200 updates, for about 2 % of the run\n"),
+        ([UPDATES, WARMUP, "7372"], "never active in this run of about 7,372 updates, whose"),
+        ([UPDATES, "--env-steps=2080"], "never active in this run of about 2 updates, whose"),
+    ],
+)
+def test_the_share_of_the_run_with_value_alignment_is_told(flags, expected):
+    assert f"value alignment: {expected}" in command_line.describe(parse(*flags).config)
+
+
+def test_the_warm_up_of_the_paper_is_told_and_not_called_scaled():
+    text = command_line.describe(config_lib.PAPER)
+    assert text.endswith("value alignment: active after 10,000 env steps, for 98 % of the run")
+
+
+def test_a_run_with_widths_of_its_own_is_of_size_custom(tmp_path):
+    config = parse("--world-model.units", "128").config
+    assert config.size == "custom"
+    assert (config.world_model.units, config.actor.units) == (128, 64)
+    command_line.validate.check(config)
+    assert parse("--world-model.units", "64").config.size == "1m"
+    assert parse("--size", "custom", "--world-model.units", "128").config == config
+
+
+def test_a_run_of_size_custom_is_resumed_as_such(experiment, tmp_path, capsys):
+    config = parse("--task", "walker_run", "--critic.units", "128").config
+    save(tmp_path / "custom", config)
+    resume = "--resume", "--logdir", "custom"
+    assert parse(*resume).config == config
+    assert experiment(*resume) == experiment(*resume, "--size", "custom") == 0
+    for flags, message in [
+        (["--size", "1m"], "size='1m': the checkpoint was trained with 'custom'"),
+        (["--critic.units", "64"], "critic.units=64: the checkpoint was trained with 128"),
+        (["--size", "2m"], "size='2m': did you mean"),
+    ]:
+        assert experiment(*resume, *flags) == 2
+        assert message in capsys.readouterr().err
 
 
 def test_a_run_without_a_checkpoint_keeps_its_settings(tmp_path):
-    config = tiny.config(task="walker_run", preset="quick", size="1m", seed=7)
-    rundir.write_config(tmp_path, config)
-    assert parse("--resume", "--logdir", str(tmp_path)).config == config
+    rundir.write_config(tmp_path, UNUSUAL)
+    assert parse("--resume", "--logdir", str(tmp_path)).config == UNUSUAL
 
 
 def test_resume_takes_the_settings_of_the_saved_run(saved):
     logdir, config = saved
     arguments = parse("--resume", "--logdir", str(logdir), "--env-steps", "1000")
     assert arguments.resume
-    assert arguments.config == tiny.config(
-        task="walker_run", preset="quick", size="1m", seed=7, env_steps=1000
-    )
+    assert arguments.config == dataclasses.replace(UNUSUAL, env_steps=1000)
     assert parse("--resume", "--logdir", str(logdir), "--preset", "quick").config == config
 
 
@@ -163,6 +229,8 @@ def test_resume_takes_the_settings_of_the_saved_run(saved):
         (["--task", "walker_walk"], "task='walker_walk': the checkpoint was"),
         (["--preset", "paper"], "preset='paper': the checkpoint was"),
         (["--world-model.stoch", "8"], "world_model.stoch=8: the checkpoint was"),
+        (["--world-model.units", "8"], "world_model.units=8: the checkpoint was"),
+        (["--size", "custom"], "size='custom': the checkpoint was trained with '1m'"),
         (["--env-steps", "40"], "env_steps=40: the checkpoint is at 48 already"),
     ],
 )

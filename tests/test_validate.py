@@ -101,6 +101,43 @@ def test_a_batch_larger_than_replay_is_blamed_and_a_smaller_one_named(preset):
     assert error.value.field == "replay.batch_length"
 
 
+QUICK = config_lib.QUICK
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        (changed("size", "bogus"), "size='bogus': use one of 1m, .*, custom"),
+        (changed("size", "12", QUICK), "size='12': did you mean '12m'"),
+        (changed("preset", "bogus"), "preset='bogus': use one of quick, paper, custom"),
+        (changed("preset", "tiny"), "preset='tiny': "),
+    ],
+)
+def test_a_config_of_no_known_size_or_preset_is_refused(config, message):
+    with pytest.raises(InvalidInput, match=message):
+        validate.check(config)
+
+
+@pytest.mark.parametrize(
+    ("config", "width"),
+    [
+        (changed("size", "12m", QUICK), "world_model.deter=2048, not 512"),
+        (changed("world_model.deter", 1024, QUICK), "world_model.deter=512, not 1024"),
+        (changed("world_model.hidden", 65, QUICK), "world_model.hidden=64, not 65"),
+        (changed("world_model.classes", 5, QUICK), "world_model.classes=4, not 5"),
+        (changed("world_model.units", 65, QUICK), "world_model.units=64, not 65"),
+        (changed("actor.units", 65, QUICK), "actor.units=64, not 65"),
+        (changed("critic.units", 65, QUICK), "critic.units=64, not 65"),
+    ],
+)
+def test_a_size_with_widths_of_another_is_refused(config, width):
+    with pytest.raises(InvalidInput, match=f"has {width}; use config.with_size") as error:
+        validate.check(config)
+    assert (error.value.field, error.value.value) == ("size", config.size)
+    validate.check(dataclasses.replace(config, size="custom"))
+    validate.check(config_lib.with_size(config, config.size))
+
+
 def test_unknown_presets_and_sizes_come_with_a_suggestion():
     with pytest.raises(InvalidInput, match="preset='papr': did you mean 'paper'"):
         validate.preset("papr")

@@ -14,8 +14,8 @@ from vawm.envs import Environment, probes
 
 CONFIG = config_lib.Config(
     task="probe_observation_action",
-    preset="tiny",
-    size="tiny",
+    preset="custom",
+    size="custom",
     seed=0,
     env_steps=96,
     num_envs=2,

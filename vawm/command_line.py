@@ -1,7 +1,9 @@
 """The command line of experiments: tyro over `Config`, two phases, one line per error.
 
 `--preset` and `--size` choose the defaults, or `--resume` takes those of the saved run;
-every other flag then overrides one field of `Config`.
+every other flag then overrides one field of `Config`. Two fields follow from others: a new
+run of preset quick gets a warm-up for its length, and one with widths of its own is of size
+custom.
 """
 
 from __future__ import annotations
@@ -54,7 +56,8 @@ def parse(argv: Sequence[str] | None, *, preset: str, description: str) -> Argum
     argv = list(sys.argv[1:] if argv is None else argv)
     default = Flags(_defaults(argv, preset))
     flags = flags_lib.read(Flags, argv, default=default, description=description)
-    return Arguments(flags.config, flags.logdir or default_logdir(flags.config), flags.resume)
+    config = _with_its_size(flags.config)
+    return Arguments(config, flags.logdir or default_logdir(config), flags.resume)
 
 
 def _defaults(argv: list[str], preset: str) -> Config:
@@ -62,6 +65,7 @@ def _defaults(argv: list[str], preset: str) -> Config:
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     parser.add_argument("--preset", nargs="?")
     parser.add_argument("--size", nargs="?")
+    parser.add_argument("--env-steps", "--env_steps", nargs="?")
     parser.add_argument("--logdir", nargs="?")
     parser.add_argument("--resume", action=argparse.BooleanOptionalAction)
     try:
@@ -69,14 +73,41 @@ def _defaults(argv: list[str], preset: str) -> Config:
     except argparse.ArgumentError:  # --resume=value
         raise InvalidInput("--resume", True, "takes no value; write --resume alone") from None
     if not known.resume or {"-h", "--help"} & set(argv):
-        return validate.preset(known.preset or preset, known.size)
+        size = None if known.size == config_lib.CUSTOM else known.size
+        return _with_its_warmup(validate.preset(known.preset or preset, size), known.env_steps)
     if known.logdir is None:
         raise InvalidInput("logdir", None, "--resume needs the --logdir of the run")
     saved = resume.saved_config(known.logdir)
-    if known.size not in (None, saved.size):
+    if known.size not in (None, saved.size, config_lib.CUSTOM):
         validate.check_choice("size", known.size, config_lib.SIZES)
         return config_lib.with_size(saved, known.size)
     return saved
+
+
+def _with_its_warmup(config: Config, env_steps: str | None) -> Config:
+    """`config`; of preset quick, with the warm-up for a run of the length that was given."""
+    try:
+        length = int(env_steps or "")
+    except ValueError:  # none, or one that the second phase refuses
+        return config
+    if config.preset != "quick":
+        return config
+    alignment = dataclasses.replace(config.value_alignment, warmup_steps=scaled_warmup(length))
+    return dataclasses.replace(config, value_alignment=alignment)
+
+
+def scaled_warmup(env_steps: int) -> int:
+    """The warm-up of preset quick, in env steps, for another length: the same share of it."""
+    quick = config_lib.QUICK
+    return quick.value_alignment.warmup_steps * env_steps // quick.env_steps
+
+
+def _with_its_size(config: Config) -> Config:
+    """`config`; of size custom where a width is not the one of its size."""
+    size = config.size
+    if size not in config_lib.SIZES or config == config_lib.with_size(config, size):
+        return config
+    return dataclasses.replace(config, size=config_lib.CUSTOM)
 
 
 def default_logdir(config: Config) -> pathlib.Path:
@@ -87,32 +118,49 @@ def default_logdir(config: Config) -> pathlib.Path:
 
 def describe(config: Config) -> str:
     """What the chosen preset is for, in a few lines."""
-    alignment = config.value_alignment
     head = (
         f"preset {config.preset}: {config.task}, {config.env_steps:,} env steps, "
         f"size {config.size}, seed {config.seed}"
     )
-    unit = alignment.warmup_unit.replace("_", " ")
-    warmup = f"{alignment.warmup_steps:,} {unit}"
-    paper = config_lib.PAPER
-    if alignment.weight == "off":
-        start = "off"
-    elif alignment.warmup_unit == "env_steps" and alignment.warmup_steps >= config.env_steps:
-        start = f"never active in this run, which is not longer than its warm-up of {warmup}"
-    else:
-        start = f"after {warmup}"
-        if config.preset == "quick":
-            scale = f"{paper.value_alignment.warmup_steps:,} of {paper.env_steps:,}"
-            start += f", a warm-up scaled to the short run (paper: {scale})"
+    alignment, paper = _describe_alignment(config), config_lib.PAPER
     if config.preset != "quick":
-        return f"{head}\nvalue alignment: {start}"
+        return f"{head}\nvalue alignment: {alignment}"
     return (
         f"{head}\n"
         "  for a CPU with 2 cores and some minutes; this is not the paper's setting\n"
-        f"  value alignment: {start}\n"
+        f"  value alignment: {alignment}\n"
         f"  the paper's setting: --preset paper ({paper.env_steps:,} env steps, "
         f"size {paper.size}, better on a GPU)"
     )
+
+
+def _describe_alignment(config: Config) -> str:
+    """From when on value alignment is active, and for how much of the run."""
+    alignment, paper = config.value_alignment, config_lib.PAPER
+    if alignment.weight == "off":
+        return "off"
+    in_updates = alignment.warmup_unit == "updates"
+    length = _updates(config) if in_updates else config.env_steps
+    warmup, unit = alignment.warmup_steps, alignment.warmup_unit.replace("_", " ")
+    about = "about " if in_updates else ""
+    if warmup >= length:
+        return (
+            f"never active in this run of {about}{length:,} {unit}, whose warm-up is {warmup:,}"
+        )
+    percent = 100 * (length - warmup) // length
+    share = f"{about}{percent} %" if percent else "less than 1 %"
+    text = f"active after {warmup:,} {unit}, for {share} of the run"
+    short = config.preset == "quick" and config.env_steps < paper.env_steps
+    if short and not in_updates and warmup == scaled_warmup(config.env_steps):
+        scale = f"{paper.value_alignment.warmup_steps:,} of {paper.env_steps:,}"
+        text += f"; the warm-up is scaled to the short run (paper: {scale})"
+    return text
+
+
+def _updates(config: Config) -> int:
+    """Updates of the whole run, but for those that the reset of each episode adds."""
+    replayed = config.env_steps // config.action_repeat - validate.smallest_replay(config)
+    return max(0, replayed) * config.train_ratio // config.replay.batch_steps
 
 
 def guard(main: Callable[[], int]) -> int:
@@ -130,5 +178,5 @@ def guard(main: Callable[[], int]) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        print("interrupted before the first step", file=sys.stderr)
+        print("interrupted", file=sys.stderr)
         return 130

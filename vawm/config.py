@@ -92,7 +92,7 @@ class ValueAlignmentConfig:
     static_weight: float = 0.5
     """used by weight="static", after the warm-up; Table 3"""
     warmup_steps: int = 10_000
-    """weight 0 up to and including this step"""
+    """weight 0 up to and including this step; in preset quick it scales with --env-steps"""
     warmup_unit: Literal["env_steps", "updates"] = "env_steps"
     dynamics_scale: float = 0.5
     """on KL[sg V(s) || V(s~)]"""
@@ -138,7 +138,9 @@ class Config:
 
     task: str = "cartpole_swingup"
     preset: str = "paper"
+    """where the other numbers come from: an entry of `PRESETS`, or custom"""
     size: str = "12m"
+    """whose widths these are: an entry of `SIZES`, or custom"""
     seed: int = 0
     env_steps: int = 500_000
     num_envs: int = 16
@@ -160,6 +162,10 @@ class Config:
     value_alignment: ValueAlignmentConfig = field(default_factory=ValueAlignmentConfig)
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     replay: ReplayConfig = field(default_factory=ReplayConfig)
+
+
+CUSTOM = "custom"
+"""the preset or size of a run that none of `PRESETS` or `SIZES` describes"""
 
 
 @dataclass(frozen=True)

@@ -117,6 +117,7 @@ def _check_number(name: str, value: Any, kind: type) -> None:
 
 
 def _check_together(config: Config) -> None:
+    _check_names(config)
     _check_widths(config)
     _check_replay(config)
     _check_counters(config)
@@ -130,6 +131,22 @@ def _check_together(config: Config) -> None:
     if scale.return_scale_low >= scale.return_scale_high:
         remedy = f"use less than imagination.return_scale_high={scale.return_scale_high}"
         raise InvalidInput("imagination.return_scale_low", scale.return_scale_low, remedy)
+
+
+def _check_names(config: Config) -> None:
+    """Preset and size are known, and a size is not the name of other widths than its own."""
+    check_choice("preset", config.preset, [*config_lib.PRESETS, config_lib.CUSTOM])
+    check_choice("size", config.size, [*config_lib.SIZES, config_lib.CUSTOM])
+    if config.size == config_lib.CUSTOM:
+        return
+    widths = dict(values(config_lib.with_size(config, config.size)))
+    for name, value in values(config):
+        if value != widths[name]:
+            remedy = (
+                f"has {name}={widths[name]}, not {value}; "
+                f"use config.with_size(..., {config.size!r}), or size={config_lib.CUSTOM!r}"
+            )
+            raise InvalidInput("size", config.size, remedy)
 
 
 def _check_widths(config: Config) -> None:
