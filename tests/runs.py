@@ -1,9 +1,11 @@
 """Runs on disk, and what two of them must have in common."""
 
 import io
+import struct
 
 import rich.console
 import toy
+from tensorboardX.proto.event_pb2 import Event
 
 from vawm import checkpoint, runner, tracking
 
@@ -24,6 +26,18 @@ def measured(logdir):
         {name: value for name, value in line.items() if name not in WALL_TIME}
         for line in lines(logdir)
     ]
+
+
+def events(logdir):
+    """What TensorBoard's files hold: records of a length, its checksum, data, its checksum."""
+    result = []
+    for path in sorted(logdir.glob("events.out.tfevents.*")):
+        data = path.read_bytes()
+        while data:
+            (length,) = struct.unpack("<Q", data[:8])
+            result.append(Event.FromString(data[12 : 12 + length]))
+            data = data[12 + length + 4 :]
+    return result
 
 
 def assert_same(actual, expected, config, env=None):

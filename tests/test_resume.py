@@ -90,6 +90,39 @@ def test_a_folder_that_is_not_of_a_run_is_refused(tmp_path, content):
         resume.check(tmp_path, tiny.CONFIG)
 
 
+def started(logdir, *reached, **changes):
+    """A run without a checkpoint whose metrics have lines at the env steps `reached`."""
+    rundir.write_config(logdir, tiny.config(**changes))
+    lines = "".join(f'{{"env_steps": {env_steps}}}\n' for env_steps in reached)
+    (logdir / "metrics.jsonl").write_text(lines + '{"half a li')
+
+
+@pytest.mark.parametrize("reached", [[], [16], [16, 31]])
+def test_a_run_that_cannot_have_saved_anything_may_start_over(tmp_path, reached):
+    started(tmp_path, *reached)
+    resume.check(tmp_path, tiny.config(save_every=1))
+
+
+@pytest.mark.parametrize(
+    ("reached", "changes"),
+    [([16, 32], {}), ([96], {}), ([48], {"env_steps": 48, "save_every": 1000})],
+)
+def test_a_run_whose_checkpoints_are_gone_is_not_started_over(tmp_path, reached, changes):
+    started(tmp_path, *reached, **changes)
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    remedy = f"checkpoints are gone.* {reached[-1]} env steps; choose another --logdir"
+    with pytest.raises(InvalidInput, match=remedy) as error:
+        resume.check(str(tmp_path), tiny.config(env_steps=10_000, save_every=5_000))
+    assert error.value.field == "logdir"
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_a_width_that_differs_is_named_rather_than_the_size_custom(saved):
+    model = dataclasses.replace(tiny.CONFIG.world_model, units=8)
+    with pytest.raises(InvalidInput, match=r"world_model.units=8: the checkpoint was"):
+        resume.check(saved, tiny.config(world_model=model))
+
+
 def test_a_finished_run_is_not_continued(saved):
     with pytest.raises(InvalidInput, match="env_steps=48: the checkpoint is at 48 already"):
         resume.check(saved, tiny.config(env_steps=48))

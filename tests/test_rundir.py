@@ -1,5 +1,6 @@
 """A run's folder: new, writable, and used by one process."""
 
+import errno
 import json
 import os
 import subprocess
@@ -71,6 +72,18 @@ def test_the_config_is_written_with_the_version(tmp_path):
     assert content["vawm"] == manifest.version()
     assert rundir.read_config(tmp_path) == tiny.CONFIG
     assert rundir.read_config(tmp_path / "nowhere") is None
+
+
+def test_a_config_that_cannot_be_written_leaves_the_folder_as_it_was(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    rundir.write_config(tmp_path, tiny.CONFIG)
+    monkeypatch.setattr(rundir.pathlib.Path, "replace", full)
+    with pytest.raises(OSError, match="No space left"):
+        rundir.write_config(tmp_path, tiny.config(seed=1))
+    assert [path.name for path in tmp_path.iterdir()] == ["config.json"]
+    assert rundir.read_config(tmp_path) == tiny.CONFIG
 
 
 def test_clearing_leaves_the_choices_and_strangers_alone(tmp_path):

@@ -1,9 +1,11 @@
 """The host loop: lines, checkpoints, signals, and resuming bit for bit."""
 
+import errno
 import io
 import json
 import math
 import os
+import shutil
 import signal
 
 import jax
@@ -12,7 +14,8 @@ import pytest
 import rich.console
 import tiny
 import toy
-from runs import assert_same, lines, quiet
+from runs import assert_same, events, lines, measured, quiet
+from tensorboardX.proto.event_pb2 import SessionLog
 
 from vawm import checkpoint, envs, memory, runner
 from vawm.envs import Environment
@@ -143,6 +146,46 @@ def test_running_out_of_memory_is_explained(tmp_path, fake):
 
 
 @pytest.mark.parametrize(
+    "broken", ["tracking.Tracker.write", "rundir.write_config", "tracking.Tracker.__init__"]
+)
+def test_a_full_disk_is_explained_in_one_line(tmp_path, fake, monkeypatch, broken):
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    fake()
+    monkeypatch.setattr(f"vawm.{broken}", full)
+    with pytest.raises(runner.RunError) as error:
+        run(tiny.CONFIG, tmp_path)
+    assert str(error.value).startswith(f"{tmp_path}: No space left on device; ")
+    assert "\n" not in str(error.value)
+
+
+def test_a_run_whose_checkpoints_are_gone_keeps_its_metrics(tmp_path, fake):
+    fake()
+    run(tiny.CONFIG, tmp_path)
+    shutil.rmtree(tmp_path / "checkpoints")
+    before = measured(tmp_path)
+    with pytest.raises(InvalidInput, match="its checkpoints are gone"):
+        run(LONG, tmp_path, resume=True)
+    assert measured(tmp_path) == before
+
+
+def test_a_signal_in_the_last_chunk_does_not_unfinish_a_run(tmp_path, fake):
+    def loss(env_steps):
+        if env_steps == 96:
+            os.kill(os.getpid(), signal.SIGINT)
+        return 1.0
+
+    fake(loss)
+    console = quiet()
+    assert run(tiny.CONFIG, tmp_path, console=console).exit_code == 130
+    text = console.file.getvalue()
+    assert "finished at 96 env steps" in text
+    assert "go on with: the same command --resume" in text
+    assert "resume with" not in text
+
+
+@pytest.mark.parametrize(
     "changes", [{"env": None}, {"resume": True}, {"config": tiny.config(num_envs=0)}]
 )
 def test_bad_input_is_refused_with_nothing_written(tmp_path, changes):
@@ -186,6 +229,36 @@ def test_k_steps_and_the_rest_equal_a_run_in_one_piece(tmp_path, uninterrupted, 
     run(tiny.config(env_steps=env_steps), tmp_path)
     run(LONG, tmp_path, resume=True)
     assert_same(tmp_path, uninterrupted, LONG, tiny.env())
+    assert starts(tmp_path) == [97]
+
+
+def starts(logdir):
+    """From where on TensorBoard drops what an earlier part of the run wrote."""
+    sessions = [event for event in events(logdir) if event.HasField("session_log")]
+    assert all(event.session_log.status == SessionLog.START for event in sessions)
+    return [event.step for event in sessions]
+
+
+def test_tensorboard_drops_a_last_line_that_is_the_only_one(tmp_path):
+    run(tiny.config(log_every=1000), tmp_path)
+    assert not starts(tmp_path)
+    run(tiny.config(log_every=1000, env_steps=112), tmp_path, resume=True)
+    assert starts(tmp_path) == [1]
+    assert len(lines(tmp_path)) == 1
+
+
+def test_metrics_that_cannot_be_cut_back_are_explained_and_kept(
+    tmp_path, uninterrupted, monkeypatch
+):
+    def full(path, _):
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    logdir = shutil.copytree(uninterrupted, tmp_path / "run")
+    before = measured(logdir)
+    monkeypatch.setattr(runner.tracking.pathlib.Path, "write_text", full)
+    with pytest.raises(runner.RunError, match=r"metrics.jsonl.tmp: No space left on device"):
+        run(tiny.config(env_steps=200), logdir, resume=True)
+    assert measured(logdir) == before
 
 
 def test_a_run_that_a_signal_stopped_goes_on_as_if_nothing_had_happened(

@@ -1,10 +1,16 @@
 """Lines of metrics: means, counts, strictly valid JSON."""
 
+import errno
 import json
 import math
+import pathlib
+import threading
 
 import numpy as np
 import pytest
+from runs import events
+from tensorboardX.proto.event_pb2 import SessionLog
+from tensorboardX.record_writer import RecordWriter
 
 from vawm import tracking
 from vawm.tracking import Interval
@@ -82,8 +88,38 @@ def test_truncation_of_nothing_is_nothing(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_tracker_writes_lines_and_tensorboard_events(tmp_path):
+def test_a_tracker_writes_lines_and_tensorboard_events_at_once(tmp_path):
+    line = closed(add_all(chunk(1, 2.0)))
     with tracking.Tracker(tmp_path) as tracker:
-        tracker.write(closed(add_all(chunk(1, 2.0))))
+        tracker.write(line)
         assert tracking.read(tmp_path / "metrics.jsonl")[0]["loss/critic"] == 2.0
-    assert list(tmp_path.glob("events.out.tfevents.*"))
+        version, event = events(tmp_path)
+    assert version.file_version == "brain.Event:2"
+    assert event.step == 100
+    assert {value.tag: value.simple_value for value in event.summary.value} == {
+        name: pytest.approx(value) for name, value in line.items() if value is not None
+    }
+
+
+def test_tensorboard_purges_from_the_step_after_the_last_that_is_kept(tmp_path):
+    with tracking.Tracker(tmp_path, purge_after=96):
+        pass
+    _, start = events(tmp_path)
+    assert (start.step, start.session_log.status) == (97, SessionLog.START)
+
+
+@pytest.mark.skipif(not pathlib.Path("/dev/full").exists(), reason="needs /dev/full")
+@pytest.mark.parametrize("name", ["metrics.jsonl", "events"])
+def test_a_full_disk_is_an_error_of_the_line_that_meets_it(tmp_path, monkeypatch, name):
+    if name == "events":
+        monkeypatch.setattr(tracking, "RecordWriter", lambda _: RecordWriter("/dev/full"))
+    else:
+        (tmp_path / name).symlink_to("/dev/full")
+    threads = threading.active_count()
+    with (
+        pytest.raises(OSError, match="No space left") as error,
+        tracking.Tracker(tmp_path) as tracker,
+    ):
+        tracker.write(closed(add_all(chunk(1, 2.0))))
+    assert error.value.errno == errno.ENOSPC
+    assert threading.active_count() == threads

@@ -8,8 +8,8 @@ import pathlib
 import jax
 import jax.numpy as jnp
 
-from vawm import checkpoint, rundir, validate
-from vawm.config import Config
+from vawm import checkpoint, rundir, tracking, validate
+from vawm.config import CUSTOM, Config
 from vawm.errors import InvalidInput
 from vawm.manifest import Manifest
 from vawm.replay import Replay
@@ -35,18 +35,42 @@ def check(logdir: str | os.PathLike[str], config: Config) -> None:
     """Whether the run in `logdir` can be continued as `config`.
 
     Raises:
-      InvalidInput: there is none, a choice differs, or there is nothing left to do.
+      InvalidInput: there is none, its checkpoints are gone, a choice differs, or there is
+        nothing left to do.
     """
-    saved = dict(validate.values(saved_config(logdir)))
+    started = saved_config(logdir)
     path = checkpoint.latest(logdir)
+    if path is None:
+        _refuse_to_lose(logdir, started)
+    saved = dict(validate.values(started))
+    choices = list(validate.values(config))
+    if config.size == CUSTOM:  # the width that differs says more, so its name comes last
+        choices.sort(key=lambda choice: choice[0] == "size")
     whose = "the checkpoint was trained" if path else "the run was started"
-    for name, value in validate.values(config):
+    for name, value in choices:
         if name not in MAY_DIFFER and value != saved[name]:
             remedy = f"{whose} with {saved[name]!r}; use that to resume"
             raise InvalidInput(name, value, remedy)
     if path and config.env_steps <= (done := int(path.name)):
         remedy = f"the checkpoint is at {done} already; use more to continue it"
         raise InvalidInput("env_steps", config.env_steps, remedy)
+
+
+def _refuse_to_lose(logdir: str | os.PathLike[str], started: Config) -> None:
+    """Refuses to start a run over, and its metrics, if it should have saved a checkpoint.
+
+    Raises:
+      InvalidInput: its metrics reach the first checkpoint that was due.
+    """
+    path = pathlib.Path(logdir).expanduser() / "metrics.jsonl"
+    lines = tracking.read(path) if path.exists() else []
+    if not lines or lines[-1]["env_steps"] < min(started.save_every, started.env_steps):
+        return
+    remedy = (
+        f"its checkpoints are gone or were never written, and starting over would lose the "
+        f"metrics of {lines[-1]['env_steps']} env steps; choose another --logdir"
+    )
+    raise InvalidInput("logdir", str(logdir), remedy)
 
 
 def restore(logdir: str | os.PathLike[str], shapes: PyTree) -> tuple[PyTree, Manifest]:

@@ -30,22 +30,22 @@ def check_new(logdir: pathlib.Path) -> None:
         raise InvalidInput("logdir", str(logdir), remedy)
 
 
-def check_writable(logdir: pathlib.Path) -> None:
-    """Refuses a path at which no folder can be written.
+def check_writable(folder: pathlib.Path, name: str = "logdir") -> None:
+    """Refuses a path at which no folder can be written; `name` is the option it came from.
 
     Raises:
       InvalidInput: nothing was written.
     """
     try:
-        nearest = logdir.absolute()
+        nearest = folder.absolute()
         while not nearest.exists():
             nearest = nearest.parent
         usable = nearest.is_dir() and os.access(nearest, os.W_OK | os.X_OK)
     except OSError:
         usable = False
     if not usable:
-        remedy = "is not writable; choose another --logdir"
-        raise InvalidInput("logdir", str(logdir), remedy)
+        remedy = f"is not writable; choose another --{name}"
+        raise InvalidInput(name, str(folder), remedy)
 
 
 @contextlib.contextmanager
@@ -78,15 +78,23 @@ def claim(logdir: pathlib.Path) -> Iterator[None]:
 
 
 def write_config(logdir: pathlib.Path, config: Config) -> None:
-    """Writes `config.json`: all choices of the run and what wrote them."""
+    """Writes `config.json`: all choices of the run and what wrote them.
+
+    Raises:
+      OSError: it could not be written; the folder is as it was before.
+    """
     content = {
         "schema": manifest_lib.SCHEMA,
         "vawm": manifest_lib.version(),
         "config": config_lib.as_dict(config),
     }
     scratch = logdir / (CONFIG + ".tmp")
-    scratch.write_text(json.dumps(content, indent=2) + "\n")
-    scratch.replace(logdir / CONFIG)
+    try:
+        scratch.write_text(json.dumps(content, indent=2) + "\n")
+        scratch.replace(logdir / CONFIG)
+    except OSError:
+        scratch.unlink(missing_ok=True)
+        raise
 
 
 def read_config(logdir: pathlib.Path) -> Config | None:

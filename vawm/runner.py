@@ -97,14 +97,14 @@ def run(
 
     Raises:
       InvalidInput: before anything is compiled, allocated or written.
-      RunError: a loss is not finite, or memory ran out.
+      RunError: a loss is not finite, memory ran out, or the disk is full.
       SaveError: a checkpoint could not be written.
     """
     logdir = pathlib.Path(logdir).expanduser()
     console = console or rich.console.Console()
     check(config, logdir, resume=resume, known_task=env is None)
     start = prepare(config, env)
-    with rundir.claim(logdir), _out_of_memory_explained():
+    with _disk_explained(logdir), _out_of_memory_explained(), rundir.claim(logdir):
         if banner:
             console.print(banner, highlight=False, soft_wrap=True, markup=False)
         if resume and checkpoint.latest(logdir):
@@ -156,6 +156,7 @@ def prepare(config: Config, env: Environment | None = None) -> Start:
     memory.check(
         memory.estimate(shapes, config),
         memory.available_bytes(),
+        configured=config.replay.capacity,
         smallest=validate.smallest_replay(config),
     )
     step = jax.jit(train.make_train_step(env, agent, config), donate_argnums=0)
@@ -182,9 +183,10 @@ def _loop(
     display = Display(console, start=progress.env_steps, total=config.env_steps)
     save = functools.partial(_save, logdir=logdir, config=config, spec=start.env.spec)
     last_saved = progress.env_steps
+    purge_after = progress.logged if progress.env_steps else None
     with (
         signals.catch(lambda: display.note("stopping after this step ...")) as stop,
-        tracking.Tracker(logdir, purge_after=progress.logged or None) as tracker,
+        tracking.Tracker(logdir, purge_after=purge_after) as tracker,
         display,
     ):
         display.note("compiling (takes a minute the first time, seconds from then on) ...")
@@ -274,21 +276,34 @@ def _out_of_memory_explained():
         raise RunError(f"out of memory: {remedy} ({first})") from error
 
 
+@contextlib.contextmanager
+def _disk_explained(logdir: pathlib.Path):
+    """What a run writes besides its checkpoints, which have a `SaveError` of their own."""
+    try:
+        yield
+    except OSError as error:
+        raise RunError(
+            f"{error.filename or logdir}: {error.strerror or error}; "
+            "put that right, then go on with --resume or start again"
+        ) from error
+
+
 def _summarise(
     config: Config, result: Result, console: rich.console.Console, command: str
 ) -> None:
     lines = tracking.read(result.logdir / "metrics.jsonl")
     returns = [e["episode/return"] for e in lines if e.get("episode/return") is not None]
     shown = f"last {returns[-1]:.1f}, best {max(returns):.1f}" if returns else "none finished"
+    finished = result.env_steps >= config.env_steps
     text = [
-        f"{'stopped' if result.exit_code else 'finished'} at {result.env_steps} env steps",
+        f"{'finished' if finished else 'stopped'} at {result.env_steps} env steps",
         f"episode return: {shown}",
         f"metrics, TensorBoard events and checkpoints: {result.logdir}",
     ]
-    if result.exit_code:
-        text.append(f"resume with: {command} --resume --logdir {result.logdir}")
-    else:
+    if finished:
         text.append(f"evaluate with: python -m vawm.evaluate --logdir {result.logdir}")
         longer = f"--env-steps {2 * config.env_steps}"
         text.append(f"go on with: {command} --resume --logdir {result.logdir} {longer}")
+    else:
+        text.append(f"resume with: {command} --resume --logdir {result.logdir}")
     console.print("\n".join(text), highlight=False, soft_wrap=True, markup=False)

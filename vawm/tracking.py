@@ -11,10 +11,14 @@ import json
 import math
 import os
 import pathlib
+import socket
+import time
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-import tensorboardX
+from tensorboardX.proto.event_pb2 import Event, SessionLog
+from tensorboardX.proto.summary_pb2 import Summary
+from tensorboardX.record_writer import RecordWriter
 
 Line = dict[str, Any]
 
@@ -122,26 +126,63 @@ def truncate(path: str | os.PathLike[str], env_steps: int) -> None:
     scratch.replace(path)
 
 
+class Board:
+    """TensorBoard's event file, written at once and here.
+
+    tensorboardX's own writer hands events to a thread, where a full disk ends the thread
+    and not the run.
+    """
+
+    def __init__(self, logdir: pathlib.Path, *, purge_after: int | None = None):
+        name = f"events.out.tfevents.{time.time():.6f}.{socket.gethostname()}"
+        self._file = RecordWriter(str(logdir / name))
+        self._add(Event(file_version="brain.Event:2"))
+        if purge_after is not None:
+            start = SessionLog(status=SessionLog.START)
+            self._add(Event(step=purge_after + 1, session_log=start))
+
+    def write(self, entry: Line) -> None:
+        """Adds what is a number in one line of metrics."""
+        finite = {k: v for k, v in entry.items() if _finite_or_none(v) is not None}
+        values = [Summary.Value(tag=name, simple_value=value) for name, value in finite.items()]
+        self._add(Event(step=entry["env_steps"], summary=Summary(value=values)))
+        self._file.flush()
+
+    def _add(self, event: Event) -> None:
+        event.wall_time = time.time()
+        self._file.write(event.SerializeToString())
+
+    def close(self) -> None:
+        self._file.close()
+
+
 class Tracker:
-    """Writes lines to `metrics.jsonl` and TensorBoard; a context manager."""
+    """Writes lines to `metrics.jsonl` and TensorBoard; a context manager.
+
+    Args:
+      logdir: the folder of the run.
+      purge_after: the last env step that TensorBoard keeps of what was written before;
+        None keeps all.
+
+    Raises:
+      OSError: a file cannot be written, here and in every method.
+    """
 
     def __init__(self, logdir: pathlib.Path, *, purge_after: int | None = None):
         self._file = (logdir / "metrics.jsonl").open("a")
-        purge = None if purge_after is None else purge_after + 1
-        self._board = tensorboardX.SummaryWriter(str(logdir), purge_step=purge)
+        self._board = Board(logdir, purge_after=purge_after)
 
     def write(self, entry: Line) -> None:
-        """Appends one line; it is in the file when this returns."""
+        """Appends one line; it is in the files when this returns."""
         self._file.write(as_json(entry) + "\n")
         self._file.flush()
-        for name, value in entry.items():
-            if _finite_or_none(value) is not None:
-                self._board.add_scalar(name, value, entry["env_steps"])
-        self._board.flush()
+        self._board.write(entry)
 
     def __enter__(self) -> Tracker:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._file.close()
-        self._board.close()
+        try:
+            self._file.close()
+        finally:
+            self._board.close()
