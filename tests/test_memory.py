@@ -45,15 +45,15 @@ def test_keys_and_small_types_are_counted_in_bytes():
 
 
 def test_what_fits_is_accepted():
-    memory.check(NEEDED, NEEDED.total)
-    memory.check(NEEDED, None)
+    memory.check(NEEDED, NEEDED.total, configured=1000)
+    memory.check(NEEDED, None, configured=1000)
 
 
 def test_what_does_not_fit_is_refused_with_the_largest_replay_that_would():
     with pytest.raises(InvalidInput) as error:
-        memory.check(NEEDED, 1500 * 2**20)
+        memory.check(NEEDED, 1500 * 2**20, configured=5000)
     assert str(error.value).startswith(
-        "replay.capacity=1000: needs 1.95 GiB, 1.46 GiB are free"
+        "replay.capacity=5000: needs 1.95 GiB for a run that fills 1000 of it, 1.46 GiB are"
     )
     assert str(error.value).endswith("use replay.capacity=500 at most")
 
@@ -63,7 +63,7 @@ def test_the_replay_that_is_named_fits_and_a_larger_one_does_not(copies):
     needed = NEEDED._replace(copies=copies)
     available = int(0.6 * needed.total)
     with pytest.raises(InvalidInput) as error:
-        memory.check(needed, available)
+        memory.check(needed, available, configured=1000)
     largest = int(error.value.remedy.split("replay.capacity=")[1].split()[0])
     for capacity, fits in [(largest, True), (largest + 1, False)]:
         replay = needed.replay // needed.replay_capacity * capacity
@@ -72,9 +72,9 @@ def test_the_replay_that_is_named_fits_and_a_larger_one_does_not(copies):
 
 
 def test_a_replay_too_small_to_learn_from_is_not_named():
-    memory.check(NEEDED, NEEDED.total, smallest=501)
+    memory.check(NEEDED, NEEDED.total, configured=1000, smallest=501)
     with pytest.raises(InvalidInput, match="use a smaller size or batch"):
-        memory.check(NEEDED, 1500 * 2**20, smallest=501)
+        memory.check(NEEDED, 1500 * 2**20, configured=1000, smallest=501)
 
 
 def test_the_estimate_of_a_quick_run_is_not_below_what_was_measured(monkeypatch):
@@ -92,7 +92,7 @@ def test_the_estimate_of_a_quick_run_is_not_below_what_was_measured(monkeypatch)
 
 def test_a_model_that_does_not_fit_alone_is_not_blamed_on_replay():
     with pytest.raises(InvalidInput, match="use a smaller size or batch"):
-        memory.check(NEEDED, 900 * 2**20)
+        memory.check(NEEDED, 900 * 2**20, configured=1000)
 
 
 def test_free_memory_is_known_here():

@@ -9,6 +9,9 @@ import rich.progress
 
 from vawm.tracking import Interval, Line
 
+SPEED_SECONDS = 600.0
+"""How far back the speed behind the ETA looks; two chunks have to fit in, or there is none."""
+
 
 class Display:
     """A context manager around the loop; `console` decides what is shown."""
@@ -24,6 +27,7 @@ class Display:
             rich.progress.TextColumn("{task.fields[status]}"),
             rich.progress.TimeRemainingColumn(elapsed_when_finished=True),
             console=console,
+            speed_estimate_period=SPEED_SECONDS,
             disable=not console.is_terminal,
         )
         self._task = self._bar.add_task("", completed=start, total=total, status="")

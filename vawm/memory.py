@@ -170,12 +170,15 @@ def _text(path: str) -> str:
         return ""
 
 
-def check(needed: Estimate, available: int | None, *, smallest: int = 1) -> None:
+def check(
+    needed: Estimate, available: int | None, *, configured: int, smallest: int = 1
+) -> None:
     """Refuses a run that cannot fit, and names the replay that would.
 
     Args:
       needed: by the run.
       available: free memory, None where that is not known.
+      configured: `replay.capacity`, of which a short run allocates only a part.
       smallest: steps in replay with which the run could still learn.
 
     Raises:
@@ -183,7 +186,10 @@ def check(needed: Estimate, available: int | None, *, smallest: int = 1) -> None
     """
     if available is None or needed.total <= available:
         return
-    numbers = f"needs {readable(needed.total)}, {readable(available)} are free ({needed}); "
+    numbers = (
+        f"needs {readable(needed.total)} for a run that fills {needed.replay_capacity} of it, "
+        f"{readable(available)} are free ({needed}); "
+    )
     step = needed.copies * needed.replay / needed.replay_capacity
     rest = needed.total - needed.copies * needed.replay
     largest = int((available - rest) / step)
@@ -191,7 +197,7 @@ def check(needed: Estimate, available: int | None, *, smallest: int = 1) -> None
         remedy = "no replay is small enough: use a smaller size or batch"
     else:
         remedy = f"use replay.capacity={largest} at most"
-    raise InvalidInput("replay.capacity", needed.replay_capacity, numbers + remedy)
+    raise InvalidInput("replay.capacity", configured, numbers + remedy)
 
 
 def readable(size: float) -> str:
