@@ -23,6 +23,7 @@ from dataclasses import dataclass
 
 from vawm import checkpoint, command_line, envs, flags, rundir, tracking, validate
 from vawm.envs.protocol import check_positive
+from vawm.errors import InvalidInput
 from vawm.runner import RunError
 
 EXPERIMENT = pathlib.Path(__file__).with_name("dmc_proprio.py")
@@ -96,13 +97,22 @@ def check(options: Options) -> None:
     """
     config = validate.preset(options.preset)
     if options.env_steps is not None:
-        validate.check(dataclasses.replace(config, env_steps=options.env_steps))
+        config = dataclasses.replace(config, env_steps=options.env_steps)
+    for seed in options.seeds:
+        validate.check(dataclasses.replace(config, seed=seed))
     weights = flags.choices(type(config.value_alignment), "weight")
     for weight in options.alignments:
         validate.check_choice("alignments", weight, weights)
     for task in options.tasks:
         envs.check_task(task)
+    for name in ("tasks", "seeds", "alignments"):
+        values = getattr(options, name)
+        if not values or len(set(values)) < len(values):
+            raise InvalidInput(name, values, "use at least one, and each once")
     check_positive("jobs", options.jobs)
+    rundir.check_writable(options.results, "results")
+    if not options.collect_only:
+        rundir.check_writable(options.runs, "runs")
     if importlib.util.find_spec("matplotlib") is None:
         raise RunError("matplotlib is missing: pip install matplotlib (or vawm[notebooks])")
 

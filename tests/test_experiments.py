@@ -41,6 +41,21 @@ benchmark, curves = load("benchmark"), load("learning_curves")
         (curves, ["--jobs", "0"], "jobs=0: use a whole number"),
         (curves, ["--env-steps", "0"], "env_steps=0: use a number above 0"),
         (curves, ["--seeds", "a"], "--seeds='a': use a whole number"),
+        (curves, ["--seeds", "0", "-1"], "seed=-1: use a number from 0 to 4294967295"),
+        (
+            curves,
+            ["--seeds", "1", "0", "1"],
+            "seeds=(1, 0, 1): use at least one, and each once",
+        ),
+        (curves, ["--seeds"], "seeds=(): use at least one"),
+        (curves, ["--alignments", "off", "off"], "alignments=('off', 'off'): use at least one"),
+        (curves, ["--tasks", *2 * ["walker_run"]], "tasks=('walker_run', 'walker_run'): use"),
+        (
+            curves,
+            ["--results", "/dev/null/a"],
+            "results='/dev/null/a': is not writable; choose",
+        ),
+        (curves, ["--runs", "/dev/null/a"], "runs='/dev/null/a': is not writable; choose anot"),
     ],
 )
 def test_bad_input_is_one_line_and_code_2(
