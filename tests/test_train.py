@@ -1,17 +1,18 @@
 """The training step: counting, determinism, donation, vmapping."""
 
-import dataclasses
+import functools
 
 import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scalar_agent
 import tiny
 
-from vawm import envs, train
+from vawm import envs, replay, train
 from vawm.agent import make_agent
-from vawm.envs import probes
+from vawm.types import Trajectory
 
 
 def make(config=tiny.CONFIG, env=None):
@@ -187,35 +188,83 @@ def test_inferred_latents_are_written_back(compiled):
     assert (old[:, :24] != new[:, :24]).any()
 
 
-def test_physics_that_fails_is_counted_and_never_stored():
-    def breaks(env):
-        def step(state, action):
-            """Every third call ends the episode early, as a non-finite state does."""
-            state, timestep = env.step(state, action)
-            failed = state.steps == 3
-            state = state._replace(steps=jnp.where(failed, -3, state.steps))
-            return state, timestep._replace(is_last=timestep.is_last | failed)
-
-        return env._replace(step=step)
-
-    env = breaks(probes.make("truncation", num_envs=2, episode_length=10))
-    init, _ = make(env=env)
-    agent = make_agent(tiny.CONFIG, env.spec)
-    state = init(jax.random.key(0))
-    collect = jax.jit(train.make_collect(env, agent, tiny.CONFIG))
-    _, buffer, metrics = collect(
-        state.learner.params, state.collector, state.replay, jax.random.key(1)
-    )
-    assert int(metrics["env/nonfinite"]) == 2
-    assert all(jnp.isfinite(x).all() for x in jax.tree.leaves(buffer.trajectory))
+def scalar_experience():
+    """A full buffer of the scalar agent that has wrapped; z is 1 in what is stored."""
+    rng, shape = np.random.default_rng(0), (2, 8)
+    no = jnp.zeros(shape, bool)
+    obs, action = (jnp.asarray(rng.normal(size=(*shape, 1)), jnp.float32) for _ in range(2))
+    trajectory = Trajectory(obs, jnp.zeros(shape), no, no, no, action)
+    latent = scalar_agent.latent(jnp.asarray(rng.normal(size=shape)), jnp.ones(shape))
+    return replay.Replay(trajectory, replay.pack(latent), head=jnp.int32(3), size=jnp.int32(8))
 
 
-def test_a_task_on_mjx_trains_in_the_same_step():
-    config = dataclasses.replace(tiny.CONFIG, task="pendulum_swingup", collect_steps=8)
-    env = envs.make("pendulum_swingup", num_envs=2, action_repeat=2)
-    init, step = make(config, env)
-    state, history = roll(jax.jit(step, donate_argnums=0), jax.jit(init)(jax.random.key(0)), 3)
+def test_latents_are_written_back_to_exactly_the_steps_they_were_inferred_at():
+    agent, config = scalar_agent.AGENT, scalar_agent.CONFIG
+    learner = train.init_learner(agent, config, jax.random.key(0))
+    before, one = scalar_experience(), jnp.asarray(1)
+    learn = jax.jit(train.make_learn(agent, config))
+    _, after, _ = learn(learner, before, jax.random.key(1), one, one)
+
+    length = config.replay.batch_length + 1
+    sample = functools.partial(replay.sample, batch_size=2, length=length, classes=2)
+    key_draw = jax.random.split(jax.random.key(1), 3)[1]
+    drawn = jax.tree.map(np.asarray, jax.jit(sample)(before, key_draw))
+    trajectory, context, (env, time) = drawn
+    assert env[0] != env[1]  # no step is in both samples
+    deter, stoch = (np.array(x) for x in before.latent)
+    for b in range(2):
+        h = context.deter[b]
+        for t in range(1, length):
+            h = h / 2 + trajectory.action[b, t - 1] + trajectory.obs[b, t]
+            deter[env[b], time[b, t]] = h
+            stoch[env[b], time[b, t]] = 0
+    np.testing.assert_allclose(after.latent.deter, deter, rtol=1e-5)
+    np.testing.assert_array_equal(after.latent.stoch, stoch)
+
+
+def test_in_bfloat16_a_step_changes_no_shape_and_no_dtype():
+    init, step = make(tiny.config(compute_dtype="bfloat16"))
+    before = jax.eval_shape(init, jax.random.key(0))
+    after, _ = jax.eval_shape(step, before)
+    chex.assert_trees_all_equal_shapes_and_dtypes(after, before)
+    assert before.replay.latent.deter.dtype == jnp.bfloat16
+    learned = jax.tree.leaves((before.learner.params, before.learner.opt_state))
+    assert jnp.bfloat16 not in {leaf.dtype for leaf in learned}
+
+
+@pytest.fixture(scope="module")
+def pendulum():
+    """`init` and `train_step` of a task on MJX, 8 calls of 2 control steps in a chunk."""
+    config = tiny.config(task="pendulum_swingup", action_repeat=2, collect_steps=8)
+    init, step = make(config, envs.make("pendulum_swingup", num_envs=2, action_repeat=2))
+    return jax.jit(init), jax.jit(step, donate_argnums=0)
+
+
+def test_a_task_on_mjx_trains_in_the_same_step(pendulum):
+    init, step = pendulum
+    state, history = roll(step, init(jax.random.key(0)), 3)
     assert history[-1]["env_steps"] == 3 * 8 * 2 * 2
     assert history[-1]["updates"] > 0
     assert all(np.isfinite(value) for value in history[-1].values())
     assert int(state.replay.size) == 24
+
+
+def test_a_nan_in_the_physics_ends_that_episode_and_is_never_stored(pendulum):
+    init, step = pendulum
+    state, _ = roll(step, init(jax.random.key(0)), 2)
+    data = state.collector.env_state.data
+    broken = data.replace(qvel=data.qvel.at[1].set(jnp.nan))
+    env_state = state.collector.env_state._replace(data=broken)
+    state = state._replace(collector=state.collector._replace(env_state=env_state))
+    state, history = roll(step, state, 1)
+    assert history[-1]["env/nonfinite"] == 1
+    assert history[-1]["episode/count"] == 1
+
+    stored = state.replay.trajectory
+    # Step 16 was observed before the failure, step 17 is the end of it and step 18 a reset.
+    assert np.argwhere(stored.is_last).tolist() == [[1, 17]]
+    assert np.argwhere(stored.is_first).tolist() == [[0, 0], [1, 0], [1, 18]]
+    assert not stored.is_terminal.any()
+    physics = state.collector.env_state.data
+    for leaf in jax.tree.leaves((state.replay, state.learner, physics.qpos, physics.qvel)):
+        assert np.isfinite(leaf).all()
