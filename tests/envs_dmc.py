@@ -82,6 +82,22 @@ def pose(env, name: str, rng: np.random.RandomState) -> None:
     place(env, name, qpos, qvel, goal)
 
 
+def hold(name: str, seen: Transitions, action: np.ndarray, *, steps: int):
+    """Last observations and summed rewards of `steps` steps of C from the states of `seen`.
+
+    Each takes one of the actions `[B, nu]`, which C clips to the range of its actuators.
+    """
+    env, obs, reward = load(name), [], []
+    for start, held in zip(zip(*seen, strict=True), action, strict=True):
+        start = Transitions(*start)
+        place(env, name, start.qpos, start.qvel, start.target)
+        env.physics.data.qacc_warmstart[:] = start.qacc_warmstart
+        taken = [env.step(held) for _ in range(steps)]
+        obs.append(flat(taken[-1].observation))
+        reward.append(sum(step.reward for step in taken))
+    return np.stack(obs), np.stack(reward)
+
+
 def transitions(name: str, *, each: int = 100, seed: int = 0) -> Transitions:
     """`each` transitions along random and along full-amplitude actions, half as many posed.
 
