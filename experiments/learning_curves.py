@@ -192,12 +192,14 @@ def plot(rows: list[dict], options: Options, path: pathlib.Path) -> None:
                 run = Run(task, alignment, seed)
                 chosen = [row for row in rows if row.items() >= vars(run).items()]
                 panel.plot(
-                    [row["env_steps"] for row in chosen],
+                    [row["env_steps"] / 1000 for row in chosen],
                     [row["return"] for row in chosen],
                     color=f"C{color}",
                     label=f"value alignment {alignment}" if seed == options.seeds[0] else None,
                 )
-        panel.set(title=task, xlabel="environment steps", ylabel="return", ylim=(0, 1000))
+        panel.set(
+            title=task, xlabel="thousand environment steps", ylabel="return", ylim=(0, 1000)
+        )
     panels[0][0].legend()
     figure.tight_layout()
     figure.savefig(path, dpi=110)
