@@ -86,7 +86,7 @@ RUNGS = [
     ("constant_reward", 400, 0.15),
     ("truncation", 600, 1.0),  # of a value of 10
     ("discounting", 400, 0.15),
-    ("observation_reward", 400, 0.15),
+    ("observation_reward", 400, 0.35),  # of values of 1 and -1, under noisy returns
     ("action_reward", 800, 0.35),  # of values up to 3.4, with a policy that still explores
     ("action_reward_discrete", 400, 0.2),
     ("observation_action", 1000, 0.5),
