@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 
 import pytest
 
@@ -18,14 +19,16 @@ with signals.catch(lambda: print("asked", flush=True)) as stop:
     libc = ctypes.CDLL(None)
     for _ in range(600):  # a call of compiled code that signals do not end
         libc.usleep(100_000)
-        if sys.argv[1] == "once" and stop.signal:
+        if sys.argv[1] != "twice" and stop.signal:
+            libc.usleep(200_000)
             break
+print("in order", flush=True)
 sys.exit(stop.exit_code)
 """
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-@pytest.mark.parametrize("times", ["once", "twice"])
+@pytest.mark.parametrize("times", ["once", "in a burst", "twice"])
 def test_signals_end_a_process_with_the_code_that_shells_expect(number, code, times):
     process = subprocess.Popen(
         [sys.executable, "-c", SCRIPT, times], stdout=subprocess.PIPE, text=True
@@ -34,8 +37,11 @@ def test_signals_end_a_process_with_the_code_that_shells_expect(number, code, ti
     process.send_signal(number)
     assert process.stdout.readline() == "asked\n"
     if times == "twice":
+        time.sleep(1.2 * signals.BURST_SECONDS)
+    if times != "once":
         process.send_signal(number)
     assert process.wait(timeout=30) == code
+    assert process.stdout.read() == ("" if times == "twice" else "in order\n")
     process.stdout.close()
 
 

@@ -6,9 +6,12 @@ import contextlib
 import os
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterator
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+BURST_SECONDS = 1.0
+"""Signals so close together are one: `timeout` sends two, a terminal one to each process."""
 
 
 class Stop:
@@ -24,7 +27,7 @@ class Stop:
 
 @contextlib.contextmanager
 def catch(notify: Callable[[], None] = lambda: None) -> Iterator[Stop]:
-    """Turns the first signal into a request, and lets the second end the process at once.
+    """Turns the first signal into a request, and lets a later one end the process at once.
 
     A thread hears of signals through a pipe, because Python runs its own handlers only
     between two calls of compiled code, which can be minutes apart. Outside the main
@@ -33,7 +36,7 @@ def catch(notify: Callable[[], None] = lambda: None) -> Iterator[Stop]:
     Args:
       notify: called at the first signal, in that thread.
     """
-    stop = Stop()
+    stop, asked = Stop(), 0.0
     if threading.current_thread() is not threading.main_thread():
         yield stop
         return
@@ -41,13 +44,15 @@ def catch(notify: Callable[[], None] = lambda: None) -> Iterator[Stop]:
     os.set_blocking(writer, False)
 
     def listen() -> None:
+        nonlocal asked
         while received := os.read(reader, 1):
             if received[0] not in SIGNALS:
                 continue
-            if stop.signal is not None:
+            if stop.signal is None:
+                stop.signal, asked = received[0], time.monotonic()
+                notify()
+            elif time.monotonic() - asked > BURST_SECONDS:
                 os._exit(128 + received[0])
-            stop.signal = received[0]
-            notify()
 
     thread = threading.Thread(target=listen, daemon=True)
     previous = {number: signal.signal(number, lambda *_: None) for number in SIGNALS}
