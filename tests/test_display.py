@@ -108,11 +108,11 @@ def test_elsewhere_every_line_of_metrics_is_a_line(clock):
         display.note("compiling [1/2] ...")
         play(display, clock, seconds=3.0)
         display.log(line(4_000, 12.34))
-        display.log(line(10_000, None))
+        display.log(line(10_016, None))
     assert shown.file.getvalue().strip().splitlines() == [
         "compiling [1/2] ...",
         "env_steps 4000/10000  updates 30  return 12.3  100 steps/s  2.5 updates/s  1 min left",
-        "env_steps 10000/10000  updates 30  return -  100 steps/s  2.5 updates/s  0 min left",
+        "env_steps 10016/10000  updates 30  return -  100 steps/s  2.5 updates/s  0 min left",
     ]
 
 

@@ -49,7 +49,7 @@ class Display:
         if self._console.is_terminal:
             return
         shown = "-" if latest is None else f"{latest:.1f}"
-        remaining = (self._total - line["env_steps"]) / max(line["env_steps_per_s"], 1e-9)
+        remaining = max(0, self._total - line["env_steps"]) / max(line["env_steps_per_s"], 1e-9)
         self._console.print(
             f"env_steps {line['env_steps']}/{self._total}  updates {line['updates']}  "
             f"return {shown}  {line['env_steps_per_s']:.0f} steps/s  "

@@ -84,10 +84,7 @@ def evaluate(
     Raises:
       InvalidInput: a number of episodes that is not positive, or an impossible seed.
     """
-    if episodes < 1:
-        raise InvalidInput("episodes", episodes, "use a number of at least 1")
-    if not 0 <= seed < 2**31:
-        raise InvalidInput("seed", seed, f"use a number from 0 to {2**31 - 1}")
+    check(episodes, seed)
     if physics == "mujoco":
         return _evaluate_mujoco(policy, episodes, seed)
     env = env or envs.make(
@@ -95,6 +92,18 @@ def evaluate(
     )
     returns = player(env, policy)(policy.params, jax.random.key(seed))
     return Score(tuple(map(float, returns)))
+
+
+def check(episodes: int, seed: int) -> None:
+    """Refuses what cannot be played.
+
+    Raises:
+      InvalidInput: names the number and the remedy.
+    """
+    if episodes < 1:
+        raise InvalidInput("episodes", episodes, "use a number of at least 1")
+    if not 0 <= seed < 2**31:
+        raise InvalidInput("seed", seed, f"use a number from 0 to {2**31 - 1}")
 
 
 def player(env: Environment, policy: Policy) -> jax.stages.Wrapped:
@@ -190,6 +199,7 @@ class Arguments:
 def main(argv: Sequence[str] | None = None) -> int:
     """Prints a line per simulation; returns the exit code."""
     arguments = flags.read(Arguments, argv, description=__doc__)
+    check(arguments.episodes, arguments.seed)
     cache.enable()
     policy = policy_lib.load(arguments.logdir)
     print(f"{policy.spec.task} at {policy.env_steps} env steps, mean +- standard error")

@@ -295,10 +295,11 @@ def _summarise(
     returns = [e["episode/return"] for e in lines if e.get("episode/return") is not None]
     shown = f"last {returns[-1]:.1f}, best {max(returns):.1f}" if returns else "none finished"
     finished = result.env_steps >= config.env_steps
+    saved = "checkpoints" if checkpoint.latest(result.logdir) else "no checkpoint yet"
     text = [
         f"{'finished' if finished else 'stopped'} at {result.env_steps} env steps",
         f"episode return: {shown}",
-        f"metrics, TensorBoard events and checkpoints: {result.logdir}",
+        f"metrics, TensorBoard events and {saved}: {result.logdir}",
     ]
     if finished:
         text.append(f"evaluate with: python -m vawm.evaluate --logdir {result.logdir}")
