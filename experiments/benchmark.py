@@ -10,6 +10,7 @@ program altogether, its metrics included, so it is plain DreamerV3.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import os
 import resource
@@ -23,7 +24,7 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 
-from vawm import envs, flags, huge_pages, train, validate
+from vawm import envs, flags, huge_pages, memory, train, validate
 from vawm.agent import make_agent, parameter_count
 from vawm.command_line import guard
 from vawm.config import PAPER, SIZES, Config, ValueAlignmentConfig, with_size
@@ -140,6 +141,21 @@ def env_steps_per_s(options: Benchmark, config: Config) -> float:
     return options.num_envs * options.env_calls / statistics.median(seconds[1:])
 
 
+def check_memory(agent, config: Config) -> None:
+    """Refuses what does not fit: two learners, and the larger part of one update."""
+    init = functools.partial(train.init_learner, agent, config)
+    learner = jax.eval_shape(init, jax.random.key(0))
+    state, params = memory.nbytes(learner), memory.nbytes(learner.params)
+    needed = 2 * (state + params) + memory.working_bytes(config) + memory.PROCESS_BYTES
+    available = memory.available_bytes()
+    if available is not None and needed > available:
+        remedy = (
+            f"needs {memory.readable(needed)}, {memory.readable(available)} are free; "
+            "use a smaller size or batch"
+        )
+        raise InvalidInput("size", config.size, remedy)
+
+
 def quartiles(values: Sequence[float]) -> list[float]:
     """The first and the third; both the value itself where there is only one."""
     if len(values) == 1:
@@ -154,6 +170,7 @@ def run(options: Benchmark) -> dict:
         "synthetic", (options.observations,), "float32", options.actions, False, 1, 1, None
     )
     agent = make_agent(config, spec)
+    check_memory(agent, config)
     batch = synthetic_batch(options, config, agent.world_model.initial(options.batch_size))
     plain = dataclasses.replace(
         config, value_alignment=dataclasses.replace(config.value_alignment, weight="off")

@@ -70,6 +70,16 @@ def test_bad_input_is_one_line_and_code_2(
     assert not list(tmp_path.iterdir())
 
 
+def test_a_benchmark_that_does_not_fit_is_refused(capsys, monkeypatch):
+    monkeypatch.setattr(benchmark.memory, "available_bytes", lambda: 2**30)
+    monkeypatch.setattr(benchmark.jax.config, "update", lambda *_: None)  # the cache stays on
+    assert command_line.guard(lambda: benchmark.main(["--size", "400m"])) == 2
+    output = capsys.readouterr()
+    assert output.err.startswith("error: size='400m': needs ")
+    assert output.err.endswith("1.00 GiB are free; use a smaller size or batch\n")
+    assert not output.out
+
+
 @pytest.fixture
 def options(tmp_path):
     return curves.Options(

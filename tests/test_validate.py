@@ -60,6 +60,7 @@ def test_every_rule_is_about_a_field():
         ("actor.min_std", 2.0, "at most actor.max_std"),
         ("replay.capacity", 31, "at least 32, or smaller batches than 2 x 8"),
         ("env_steps", 31, "at least 32, what the first update needs"),
+        ("num_envs", 20, "gets to hold 3 steps of each and needs 9; use 5"),
         ("collect_steps", 33, "at most 32"),
         ("seed", 2**32, "from 0 to 4294967295"),
         ("replay.batch_length", 1, "at least 2"),
@@ -71,6 +72,10 @@ def test_bad_values_come_with_a_remedy(name, value, remedy):
     with pytest.raises(InvalidInput, match=remedy) as error:
         validate.check(changed(name, value))
     assert error.value.field == name
+
+
+def test_the_number_of_environments_that_is_named_fits():
+    validate.check(tiny.config(num_envs=5))
 
 
 @pytest.mark.parametrize(

@@ -194,7 +194,7 @@ def check(
     rest = needed.total - needed.copies * needed.replay
     largest = int((available - rest) / step)
     if largest < smallest:
-        remedy = "no replay is small enough: use a smaller size or batch"
+        remedy = "no replay is small enough: use a smaller size or batch, or fewer num_envs"
     else:
         remedy = f"use replay.capacity={largest} at most"
     raise InvalidInput("replay.capacity", configured, numbers + remedy)

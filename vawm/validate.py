@@ -175,6 +175,7 @@ def _check_replay(config: Config) -> None:
     fits = replay.capacity // num_envs >= needed
     if not (fits and config.env_steps >= needed_env_steps):
         _blame_batch(config)
+        _blame_envs(config, needed)
     if not fits:
         remedy = f"use at least {needed * num_envs}, or {batches}"
         raise InvalidInput("replay.capacity", replay.capacity, remedy)
@@ -212,6 +213,26 @@ def _blame_batch(config: Config) -> None:
     raise InvalidInput(
         "replay.batch_size", replay.batch_size, f"{too_large}; use {largest} at most"
     )
+
+
+def _blame_envs(config: Config, needed: int) -> None:
+    """Refuses more environments than the preset's for what replay gets to hold of each.
+
+    Raises:
+      InvalidInput: with a number that would do; not for a usual number, nor if a single
+        environment were too many.
+    """
+    usual = config_lib.PRESETS.get(config.preset, config_lib.PAPER).num_envs
+    held = min(config.replay.capacity, config.env_steps // config.action_repeat)
+    # n environments need n * (L + ceil(B * L / n)), which is below n * (L + 1) + B * L.
+    enough = (held - config.replay.batch_steps) // (config.replay.batch_length + 1)
+    if config.num_envs <= usual or enough < 1:
+        return
+    remedy = (
+        f"replay gets to hold {held // config.num_envs} steps of each and needs {needed}; "
+        f"use {enough}"
+    )
+    raise InvalidInput("num_envs", config.num_envs, remedy)
 
 
 def _check_counters(config: Config) -> None:
