@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Literal
 
 import jax
@@ -31,6 +32,14 @@ def network(
     )
 
 
+def blank(config: WorldModelConfig, batch_size: int, *, dtype: jnp.dtype) -> Latent:
+    """The latents before the first observation: all zero."""
+    return Latent(
+        jnp.zeros((batch_size, config.deter), dtype),
+        jnp.zeros((batch_size, config.stoch, config.classes), dtype),
+    )
+
+
 def rssm(
     config: WorldModelConfig,
     spec: EnvSpec,
@@ -55,7 +64,6 @@ def rssm(
     """
     heads = vector_heads(config, spec, dtype)
     net = network(config, actions=spec.action_size, tokens=heads.token_size, dtype=dtype)
-    stoch_shape = config.stoch, config.classes
 
     def apply(params: PyTree, method, *args):
         return net.apply({"params": params["rssm"]}, *args, method=method)
@@ -68,12 +76,6 @@ def rssm(
         widths = config.deter, config.stoch * config.classes, spec.action_size, heads.token_size
         params = net.init(key_rssm, *(jnp.zeros((1, width), dtype) for width in widths))
         return {"rssm": params["params"], **heads.init(key_heads)}
-
-    def initial(batch_size: int) -> Latent:
-        return Latent(
-            jnp.zeros((batch_size, config.deter), dtype),
-            jnp.zeros((batch_size, *stoch_shape), dtype),
-        )
 
     def observe(
         params: PyTree,
@@ -134,4 +136,5 @@ def rssm(
         latent = Latent(deter, sample(logits, uniform))
         return (blocks, latent), latent
 
+    initial = functools.partial(blank, config, dtype=dtype)
     return WorldModel(init, initial, observe, starts, imagine, heads.predict)
