@@ -99,6 +99,13 @@ def test_a_discrete_actor_gives_one_hot_actions():
     np.testing.assert_array_equal(np.sort(action, -1), [[0, 0, 1]] * 2)
 
 
-def test_the_compute_dtype_is_float32_on_cpu_unless_asked_otherwise():
-    assert jax.default_backend() != "cpu" or resolve_dtype("auto") == jnp.float32
+@pytest.mark.parametrize(
+    ("backend", "auto"), [("cpu", jnp.float32), ("gpu", jnp.bfloat16), ("tpu", jnp.bfloat16)]
+)
+def test_the_compute_dtype_follows_the_device_unless_asked_otherwise(
+    backend, auto, monkeypatch
+):
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    assert resolve_dtype("auto") == auto
     assert resolve_dtype("bfloat16") == jnp.bfloat16
+    assert resolve_dtype("float32") == jnp.float32

@@ -133,6 +133,8 @@ def test_the_command_line_reports_each_simulation(saved, monkeypatch, capsys):
     ("flags", "message"),
     [
         (["--logdir", "."], "logdir='.': holds no checkpoint"),
+        (["--logdir", ".", "--episodes", "0"], "episodes=0: use a number of at least 1"),
+        (["--logdir", ".", "--seed", "-1"], "seed=-1: use a number from 0"),
         ([], "--logdir=None: is required"),
         (["--logdir", ".", "--physics", "mujok"], "--physics='mujok': did you mean 'mujoco'"),
         (["--logdir", ".", "--episode", "3"], "--episode='3': no such flag; did you mean"),

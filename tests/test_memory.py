@@ -1,6 +1,7 @@
 """The estimate before anything is allocated."""
 
 import dataclasses
+import pathlib
 
 import jax
 import jax.numpy as jnp
@@ -108,7 +109,9 @@ def test_a_model_that_does_not_fit_alone_is_not_blamed_on_replay():
 
 
 def test_free_memory_is_known_here():
-    assert memory.available_bytes() is None or memory.available_bytes() > 0
+    if not pathlib.Path("/proc/meminfo").exists():
+        pytest.skip("only Linux tells")
+    assert memory.available_bytes() > 0
 
 
 def test_a_control_group_lowers_what_is_free(tmp_path, monkeypatch):
