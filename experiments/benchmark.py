@@ -146,7 +146,7 @@ def check_memory(agent, config: Config) -> None:
     init = functools.partial(train.init_learner, agent, config)
     learner = jax.eval_shape(init, jax.random.key(0))
     state, params = memory.nbytes(learner), memory.nbytes(learner.params)
-    needed = 2 * (state + params) + memory.working_bytes(config) + memory.PROCESS_BYTES
+    needed = 2 * (state + params) + memory.working_bytes(config) + memory.process_bytes()
     available = memory.available_bytes()
     if available is not None and needed > available:
         remedy = (
@@ -194,6 +194,7 @@ def run(options: Benchmark) -> dict:
         "cores": os.cpu_count(),
         "jax": jax.__version__,
         "batch": [options.batch_size, options.batch_length],
+        "repeats": options.repeats,
         "update_s_median": statistics.median(on.seconds),
         "update_s_min": min(on.seconds),
         "update_s_median_off": statistics.median(off.seconds),

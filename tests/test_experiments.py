@@ -70,6 +70,33 @@ def test_bad_input_is_one_line_and_code_2(
     assert not list(tmp_path.iterdir())
 
 
+class FakeUpdate:
+    """Takes 1, 2, 3 ... seconds an update; twice as long with value alignment."""
+
+    compile_seconds = 5.0
+
+    def __init__(self, agent, config, batch, aligned):
+        self.learner = benchmark.train.init_learner(agent, config, benchmark.jax.random.key(0))
+        self.factor, self.seconds = 1 + aligned, []
+
+    def run(self):
+        self.seconds.append(self.factor * (len(self.seconds) + 1.0))
+
+
+def test_the_benchmark_prints_one_object_of_medians(capsys, monkeypatch):
+    monkeypatch.setattr(benchmark, "TimedUpdate", FakeUpdate)
+    monkeypatch.setattr(benchmark, "env_steps_per_s", lambda *_: 7.0)
+    monkeypatch.setattr(benchmark.jax.config, "update", lambda *_: None)  # the cache stays on
+    assert benchmark.main(["--size", "1m", "--json", "--repeats", "4"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["params"] == 640_867
+    assert (printed["update_s_median"], printed["update_s_min"]) == (5.0, 2.0)
+    assert (printed["update_s_median_off"], printed["overhead_percent"]) == (2.5, 100.0)
+    assert printed["overhead_percent_quartiles"] == [100.0, 100.0]
+    assert (printed["compile_s"], printed["env_steps_per_s"]) == (5.0, 7.0)
+    assert printed["peak_rss_gb"] > 0
+
+
 def test_a_benchmark_that_does_not_fit_is_refused(capsys, monkeypatch):
     monkeypatch.setattr(benchmark.memory, "available_bytes", lambda: 2**30)
     monkeypatch.setattr(benchmark.jax.config, "update", lambda *_: None)  # the cache stays on

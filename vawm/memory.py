@@ -83,7 +83,6 @@ def estimate(state: PyTree, config: Config) -> Estimate:
     replay, params = nbytes(state.replay), nbytes(state.learner.params)
     optimizer = nbytes(state.learner.opt_state)
     num_envs, per_env = state.replay.trajectory.reward.shape
-    on_cpu = jax.default_backend() == "cpu"
     return Estimate(
         replay=replay,
         replay_capacity=num_envs * per_env,
@@ -91,9 +90,14 @@ def estimate(state: PyTree, config: Config) -> Estimate:
         optimizer=optimizer,
         other_state=nbytes(state) - replay - params - optimizer,
         working=working_bytes(config) + 2 * params,  # gradient and update
-        process=PROCESS_BYTES if on_cpu else COMPILER_BYTES,
-        copies=2 if on_cpu else 1,
+        process=process_bytes(),
+        copies=2 if jax.default_backend() == "cpu" else 1,
     )
+
+
+def process_bytes() -> int:
+    """What a program takes of the first device's memory, whatever the run's size."""
+    return PROCESS_BYTES if jax.default_backend() == "cpu" else COMPILER_BYTES
 
 
 def nbytes(tree: PyTree) -> int:

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: the first asks a run to stop in order, the second ends it."""
+"""Ctrl-C and SIGTERM: the first asks a run to stop in order, a later one ends it."""
 
 from __future__ import annotations
 
