@@ -19,7 +19,7 @@ from vawm import transforms
 from vawm.actor_critic import Actor, Critic
 from vawm.agent import Agent
 from vawm.distributions import Policy
-from vawm.types import EnvSpec, Inference, Latent, Params, Predictions
+from vawm.types import EnvSpec, Inference, Latent, Params, Predictions, vector
 from vawm.world_model.protocol import WorldModel
 
 CONFIG = dataclasses.replace(  # no scale is 1, so that none can be forgotten unseen
@@ -103,7 +103,7 @@ def policy(params, latent):
 
 
 AGENT = Agent(
-    spec=EnvSpec("scalar", (1,), "float32", 1, False, 2, 1, None),
+    spec=EnvSpec("scalar", vector(1), 1, False, 2, 1, None),
     world_model=WorldModel(
         init=lambda key: PARAMS.world_model,
         initial=lambda batch_size: latent(jnp.zeros(batch_size), jnp.zeros(batch_size)),
@@ -112,7 +112,7 @@ AGENT = Agent(
         imagine=imagine,
         predict=predict,
     ),
-    actor=Actor(lambda key: PARAMS.actor, policy),
+    actor=Actor(lambda key: PARAMS.actor, policy, behaviour=policy),
     critic=Critic(
         init=lambda key: PARAMS.critic,
         logits=lambda params, latent: around(params * sum(numbers(latent))),

@@ -8,7 +8,7 @@ import tiny
 
 from vawm.agent import make_agent, parameter_count, resolve_dtype
 from vawm.config import PAPER, with_size
-from vawm.types import EnvSpec, TimeStep
+from vawm.types import EnvSpec, TimeStep, image, vector
 
 # The official DreamerV3's counts for 24 observations and 6 continuous actions.
 OFFICIAL = {
@@ -34,10 +34,19 @@ OFFICIAL = {
     },
     "25m": {"total": 21_782_947},
 }
+# The same for images of 64 x 64 x 3, by number of actions: continuous, discrete.
+OFFICIAL_FROM_PIXELS = {
+    ("1m", 6, False): 686_846,
+    ("1m", 18, True): 688_004,
+    ("12m", 6, False): 10_494_158,
+    ("12m", 18, True): 10_498_772,
+    ("25m", 6, False): 23_489_326,
+    ("25m", 18, True): 23_496_244,
+}
 
 
 def spec(discrete=False):
-    return EnvSpec("test", (24,), "float32", 6, discrete, 1, 1, None)
+    return EnvSpec("test", vector(24), 6, discrete, 1, 1, None)
 
 
 @pytest.mark.parametrize("size", OFFICIAL)
@@ -48,6 +57,14 @@ def test_parameter_counts_are_the_official_ones(size):
     actual |= {"actor": parameter_count(params.actor), "critic": parameter_count(params.critic)}
     actual["total"] = parameter_count(params)
     assert {name: actual[name] for name in OFFICIAL[size]} == OFFICIAL[size]
+
+
+@pytest.mark.parametrize(("size", "actions", "discrete"), OFFICIAL_FROM_PIXELS)
+def test_parameter_counts_from_pixels_are_the_official_ones(size, actions, discrete):
+    pixels = EnvSpec("test", image(64), actions, discrete, 1, 1, None)
+    agent = make_agent(with_size(PAPER, size), pixels)
+    params = jax.eval_shape(agent.init, jax.random.key(0))
+    assert parameter_count(params) == OFFICIAL_FROM_PIXELS[size, actions, discrete]
 
 
 def observation(agent, is_first, is_last):

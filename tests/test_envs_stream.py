@@ -187,7 +187,7 @@ def test_every_task_has_a_spec(name):
     spec = envs.make(name, num_envs=1).spec
     assert spec.task == name
     assert spec.action_size > 0
-    assert len(spec.obs_shape) == 1
+    assert len(spec.obs.shape) == 1
 
 
 @pytest.mark.parametrize(

@@ -3,16 +3,14 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 import tiny
 from test_nets import block_gru_twin, float64, layer, noisy
 
-from vawm.errors import InvalidInput
-from vawm.types import EnvSpec, Trajectory
+from vawm.types import EnvSpec, Trajectory, vector
 from vawm.world_model.rssm import rssm
 
 CONFIG = tiny.CONFIG.world_model
-SPEC = EnvSpec("test", (5,), "float32", 3, False, 2, 1, None)
+SPEC = EnvSpec("test", vector(5), 3, False, 2, 1, None)
 BATCH, LENGTH = 3, 6
 
 
@@ -59,7 +57,7 @@ def test_observe_matches_the_recursion_given_its_samples():
         params, jax.random.key(2), start(model), obs, prev_action, is_first, train=True
     )
     p, rssm_p = float64(params), float64(params["rssm"])
-    tokens = mlp(p["encoder"], symlog(np.asarray(obs, np.float64)))
+    tokens = mlp(p["encoder"]["vector"], symlog(np.asarray(obs, np.float64)))
     deter, stoch = (np.asarray(x, np.float64) for x in start(model))
     for t in range(LENGTH):
         keep = 1.0 - np.asarray(is_first)[:, t, None]
@@ -174,8 +172,3 @@ def test_bfloat16_products_keep_float32_parameters_and_logits():
     )
     assert carry.deter.dtype == carry.stoch.dtype == jnp.bfloat16
     assert inference.post_logits.dtype == inference.prior_logits.dtype == jnp.float32
-
-
-def test_images_are_refused_by_the_vector_heads():
-    with pytest.raises(InvalidInput, match="obs_shape"):
-        rssm(CONFIG, SPEC._replace(obs_shape=(64, 64, 3)))

@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vawm.types import EnvSpec, Params
+from vawm.types import EnvSpec, Params, vector
 
-SPEC = EnvSpec("toy", (3,), "float32", 1, False, 2, 1, None)
+SPEC = EnvSpec("toy", vector(3), 1, False, 2, 1, None)
 
 
 class Learner(NamedTuple):

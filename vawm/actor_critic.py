@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -10,6 +11,7 @@ import jax.numpy as jnp
 from vawm import distributions, nets, transforms
 from vawm.config import ActorConfig, CriticConfig
 from vawm.distributions import Policy
+from vawm.errors import InvalidInput
 from vawm.types import Array, EnvSpec, Key, Latent, PyTree
 
 
@@ -18,6 +20,7 @@ class Actor(NamedTuple):
 
     init: Callable[[Key], PyTree]
     policy: Callable[[PyTree, Latent], Policy]
+    behaviour: Callable[[PyTree, Latent], Policy]  # what collects: `policy`, cooled or not
 
 
 class Critic(NamedTuple):
@@ -37,7 +40,14 @@ def features(latent: Latent) -> tuple[Array, Array]:
 def make_actor(
     config: ActorConfig, spec: EnvSpec, feature_size: int, dtype: jnp.dtype = jnp.float32
 ) -> Actor:
-    """A one-hot categorical or a bounded normal, by the kind of action in `spec`."""
+    """A one-hot categorical or a bounded normal, by the kind of action in `spec`.
+
+    Raises:
+      InvalidInput: a temperature for continuous actions.
+    """
+    if not spec.discrete and config.collect_temperature != 1.0:
+        remedy = "use 1: only discrete policies have one"
+        raise InvalidInput("actor.collect_temperature", config.collect_temperature, remedy)
     heads = 1 if spec.discrete else 2
     net = nets.MLP(
         feature_size,
@@ -51,16 +61,24 @@ def make_actor(
     def init(key: Key) -> PyTree:
         return net.init(key, jnp.zeros((1, feature_size), dtype))["params"]
 
-    def policy(params: PyTree, latent: Latent) -> Policy:
+    def read(params: PyTree, latent: Latent) -> list[Array]:
         outputs = net.apply({"params": params}, *features(latent))
-        outputs = [jnp.asarray(x, jnp.float32) for x in outputs]
-        if spec.discrete:
-            return distributions.one_hot_categorical(*outputs, unimix=config.unimix)
+        return [jnp.asarray(x, jnp.float32) for x in outputs]
+
+    def discrete(params: PyTree, latent: Latent, temperature: float = 1.0) -> Policy:
+        (logits,) = read(params, latent)
+        return distributions.one_hot_categorical(logits / temperature, unimix=config.unimix)
+
+    def continuous(params: PyTree, latent: Latent) -> Policy:
+        mean, std_logit = read(params, latent)
         return distributions.bounded_normal(
-            *outputs, min_std=config.min_std, max_std=config.max_std
+            mean, std_logit, min_std=config.min_std, max_std=config.max_std
         )
 
-    return Actor(init, policy)
+    if not spec.discrete:
+        return Actor(init, continuous, continuous)
+    cooled = functools.partial(discrete, temperature=config.collect_temperature)
+    return Actor(init, discrete, cooled)
 
 
 def make_critic(

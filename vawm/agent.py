@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -46,24 +46,40 @@ class Agent(NamedTuple):
         )
 
     def act(
-        self, params: Params, key: Key, carry: PolicyCarry, timestep: TimeStep
+        self,
+        params: Params,
+        key: Key,
+        carry: PolicyCarry,
+        timestep: TimeStep,
+        *,
+        how: Literal["collect", "sample", "mode"] = "sample",
     ) -> tuple[PolicyCarry, Array]:
-        """Filter `timestep` (`[N, ...]`) and sample an action from the policy.
+        """Filter `timestep` (`[N, ...]`) and choose an action.
 
         The action is raw: environments clip it. It is zero where an episode has ended,
         since nothing leaves from a last observation.
+
+        Args:
+          params: of the agent.
+          key: for latents and actions.
+          carry: what the agent remembers.
+          timestep: what has arrived.
+          how: sample the policy; sample what collects, at its temperature; or take the
+            policy's mode.
         """
         key_observe, key_action = jax.random.split(key)
         latent, _ = self.world_model.observe(
             params.world_model,
             key_observe,
             carry.latent,
-            timestep.obs[:, None],
+            jax.tree.map(lambda x: x[:, None], timestep.obs),
             carry.action[:, None],
             timestep.is_first[:, None],
             train=False,
         )
-        action = self.actor.policy(params.actor, latent).sample(key_action)
+        choose = self.actor.behaviour if how == "collect" else self.actor.policy
+        policy = choose(params.actor, latent)
+        action = policy.mode() if how == "mode" else policy.sample(key_action)
         action = jnp.where(timestep.is_last[:, None], 0.0, action)
         return PolicyCarry(latent, action), action
 

@@ -19,7 +19,7 @@ import numpy as np
 from vawm import config as config_lib
 from vawm.config import Config
 from vawm.errors import InvalidInput
-from vawm.types import EnvSpec
+from vawm.types import ArraySpec, EnvSpec, PyTree
 
 SCHEMA = 1
 NAME, DIGEST = "manifest.json", "manifest.sha256"
@@ -93,6 +93,10 @@ def config_from_dict(content: dict[str, Any], cls: type = Config) -> Any:
             f"{cls.__name__}.{name}", content.get(name), f"{verb} (other version)"
         )
     hints = typing.get_type_hints(cls)
+    if cls is Config:
+        hints["env"] = config_lib.ENV_CONFIGS.get(content["suite"])
+        if hints["env"] is None:
+            raise InvalidInput("Config.suite", content["suite"], "is not known (other version)")
     return cls(
         **{
             name: config_from_dict(value, hints[name])
@@ -108,7 +112,7 @@ def write(folder: pathlib.Path, manifest: Manifest) -> None:
     content = manifest._asdict() | {
         "schema": SCHEMA,
         "config": config_lib.as_dict(manifest.config),
-        "spec": manifest.spec._asdict(),
+        "spec": manifest.spec._asdict() | {"obs": _obs_as_dict(manifest.spec.obs)},
         "leaves": {
             item: {path: info._asdict() for path, info in leaves.items()}
             for item, leaves in manifest.leaves.items()
@@ -155,7 +159,7 @@ def read(folder: pathlib.Path) -> Manifest:
         version=content["version"],
         env_steps=content["env_steps"],
         config=config_from_dict(content["config"]),
-        spec=EnvSpec(**spec | {"obs_shape": tuple(spec["obs_shape"])}),
+        spec=EnvSpec(**spec | {"obs": _obs_from_dict(spec["obs"])}),
         progress=content["progress"],
         leaves={
             item: {path: _leaf_info(entry) for path, entry in leaves.items()}
@@ -163,6 +167,20 @@ def read(folder: pathlib.Path) -> Manifest:
         },
         files={path: (size, digest) for path, (size, digest) in content["files"].items()},
     )
+
+
+def _obs_as_dict(obs: PyTree) -> dict[str, Any]:
+    """`EnvSpec.obs`, ready for JSON: a dict of arrays is kept under "entries"."""
+    if isinstance(obs, dict):
+        return {"entries": {name: _obs_as_dict(entry) for name, entry in obs.items()}}
+    return {"shape": list(obs.shape), "dtype": str(jnp.dtype(obs.dtype))}
+
+
+def _obs_from_dict(content: dict[str, Any]) -> PyTree:
+    """The inverse of `_obs_as_dict`."""
+    if "entries" in content:
+        return {name: _obs_from_dict(entry) for name, entry in content["entries"].items()}
+    return ArraySpec(tuple(content["shape"]), jnp.dtype(content["dtype"]))
 
 
 def _leaf_info(entry: dict[str, Any]) -> LeafInfo:

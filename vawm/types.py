@@ -18,11 +18,28 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 
 Array = jax.Array
 Key = jax.Array
 PyTree = Any
 Metrics = dict[str, jax.Array]
+ArraySpec = jax.ShapeDtypeStruct
+
+
+def vector(size: int) -> ArraySpec:
+    """An observation of `size` float32 numbers."""
+    return ArraySpec((size,), jnp.float32)
+
+
+def image(size: int, channels: int = 3) -> ArraySpec:
+    """An observation of `size` x `size` pixels, channels last, uint8."""
+    return ArraySpec((size, size, channels), jnp.uint8)
+
+
+def is_image(obs: Any) -> bool:
+    """Whether an array or `ArraySpec` holds pixels: all bytes do, and nothing else."""
+    return obs.dtype == jnp.uint8
 
 
 class EnvSpec(NamedTuple):
@@ -30,8 +47,8 @@ class EnvSpec(NamedTuple):
 
     Attributes:
       task: name of the task, such as "walker_walk".
-      obs_shape: shape of one observation, without batch.
-      obs_dtype: "float32" for vectors, "uint8" for images.
+      obs: an `ArraySpec`, or a dict of them, of one observation without batch: float32
+        vectors `[D]`, uint8 images `[size, size, channels]`.
       action_size: width of the action vector, or number of discrete actions.
       discrete: whether actions are one-hot choices.
       num_envs: N, environments stepped at once.
@@ -40,8 +57,7 @@ class EnvSpec(NamedTuple):
     """
 
     task: str
-    obs_shape: tuple[int, ...]
-    obs_dtype: str
+    obs: PyTree
     action_size: int
     discrete: bool
     num_envs: int
@@ -57,7 +73,7 @@ class TimeStep(NamedTuple):
     reward is 0 and it carries `is_first`.
     """
 
-    obs: Array  # [N, *obs_shape]
+    obs: PyTree  # [N, ...] as EnvSpec.obs says
     reward: Array  # [N] float32
     is_first: Array  # [N] bool
     is_last: Array  # [N] bool
@@ -67,7 +83,7 @@ class TimeStep(NamedTuple):
 class Trajectory(NamedTuple):
     """A `TimeStep` and the raw action that left from it, `[B, T, ...]`."""
 
-    obs: Array
+    obs: PyTree
     reward: Array
     is_first: Array
     is_last: Array
@@ -106,7 +122,7 @@ class Imagined(NamedTuple):
 class Predictions(NamedTuple):
     """What the heads read from a latent, any leading dims."""
 
-    obs: Array  # [..., *obs_shape], in symlog units for vectors
+    obs: PyTree  # as EnvSpec.obs: symlog units for vectors, [0, 1] for images
     reward: Array  # [..., bins] logits of the symexp two-hot
     cont: Array  # [...] logit of discount * P(not terminal)
 

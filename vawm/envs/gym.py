@@ -85,7 +85,7 @@ def compiled(env: Environment) -> Environment:
 
 def make_spaces(spec: EnvSpec) -> tuple[spaces.Box, spaces.Box]:
     """Observation and action space of one environment."""
-    observation = spaces.Box(-np.inf, np.inf, spec.obs_shape, np.float32)
+    observation = spaces.Box(-np.inf, np.inf, spec.obs.shape, np.float32)
     return observation, spaces.Box(-1.0, 1.0, (spec.action_size,), np.float32)
 
 

@@ -29,7 +29,7 @@ from numpy.typing import ArrayLike
 
 from vawm.envs.protocol import Environment, EnvState, check_positive
 from vawm.errors import InvalidInput
-from vawm.types import Array, EnvSpec, Key, TimeStep
+from vawm.types import Array, EnvSpec, Key, TimeStep, vector
 
 PROBES = (
     "constant_reward",
@@ -109,8 +109,7 @@ def make(name: str, *, num_envs: int, episode_length: int = 4) -> Environment:
     return Environment(
         spec=EnvSpec(
             task=f"probe_{name}",
-            obs_shape=(2,),
-            obs_dtype="float32",
+            obs=vector(2),
             action_size=action_size,
             discrete=discrete,
             num_envs=num_envs,

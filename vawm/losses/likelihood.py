@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import chex
 import jax
@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from vawm.transforms import categorical_kl, symlog, two_hot_cross_entropy, unimix_logits
 
 Array = jax.Array
+PyTree = Any
 
 
 class PredictionLoss(NamedTuple):
@@ -22,10 +23,10 @@ class PredictionLoss(NamedTuple):
 
 
 def prediction_loss(
-    obs_prediction: Array,
+    obs_prediction: PyTree,
     reward_logits: Array,
     cont_logit: Array,
-    obs: Array,
+    obs: PyTree,
     reward: Array,
     is_terminal: Array,
     *,
@@ -39,26 +40,31 @@ def prediction_loss(
     the two-hot cross-entropy used here.
 
     Args:
-      obs_prediction: `[..., D]` in symlog units, or `[..., H, W, C]` in [0, 1] for images.
+      obs_prediction: `[..., D]` in symlog units, or `[..., H, W, C]` in [0, 1] for images; or
+        a tree of such, whose losses are added up.
       reward_logits: `[..., bins]`.
       cont_logit: `[...]`.
-      obs: `[..., D]` floats in raw units, or `[..., H, W, C]` uint8.
+      obs: `[..., D]` floats in raw units, or `[..., H, W, C]` uint8; the same tree.
       reward: `[...]` in environment units.
       is_terminal: `[...]` bool.
       bins: `[bins]` of the reward head.
       discount: gamma, which the continue head learns along with the end of episodes.
     """
     chex.assert_equal_shape([cont_logit, reward, is_terminal])
-    if jnp.issubdtype(obs.dtype, jnp.integer):
-        reconstruction = image_mse(obs_prediction, obs)
-    else:
-        reconstruction = symlog_mse(obs_prediction, obs)
+    parts = jax.tree.map(reconstruction_loss, obs_prediction, obs)
+    reconstruction = jax.tree.reduce(jnp.add, parts)
     chex.assert_equal_shape([reconstruction, reward])
     return PredictionLoss(
         reconstruction=reconstruction,
         reward=two_hot_cross_entropy(reward_logits, reward, bins),
         cont=continue_loss(cont_logit, discount * (1.0 - is_terminal)),
     )
+
+
+def reconstruction_loss(prediction: Array, target: Array) -> Array:
+    """`[...]` of one array: `image_mse` of bytes, `symlog_mse` of floats."""
+    is_image = jnp.issubdtype(target.dtype, jnp.integer)
+    return image_mse(prediction, target) if is_image else symlog_mse(prediction, target)
 
 
 def symlog_mse(prediction: Array, target: Array) -> Array:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from vawm import distributions, nets
 from vawm.config import WorldModelConfig
 from vawm.types import Array, EnvSpec, Inference, Key, Latent, PyTree, Trajectory
-from vawm.world_model.heads import flat_stoch, vector_heads
+from vawm.world_model.heads import flat_stoch, make_heads
 from vawm.world_model.protocol import WorldModel
 
 
@@ -62,7 +62,7 @@ def rssm(
       noise: whether z~ is sampled with its own noise or with the noise of z ("shared":
         equal distributions then give equal samples).
     """
-    heads = vector_heads(config, spec, dtype)
+    heads = make_heads(config, spec, dtype)
     net = network(config, actions=spec.action_size, tokens=heads.token_size, dtype=dtype)
 
     def apply(params: PyTree, method, *args):
@@ -81,7 +81,7 @@ def rssm(
         params: PyTree,
         key: Key,
         carry: Latent,
-        obs: Array,
+        obs: PyTree,
         prev_action: Array,
         is_first: Array,
         *,
@@ -90,7 +90,9 @@ def rssm(
         del train  # nothing in this model differs between training and acting
         key_post, key_prior = jax.random.split(key)
         batch, length = is_first.shape
-        obs, prev_action, is_first = (x.swapaxes(0, 1) for x in (obs, prev_action, is_first))
+        obs, prev_action, is_first = jax.tree.map(
+            lambda x: x.swapaxes(0, 1), (obs, prev_action, is_first)
+        )
         keep = 1.0 - is_first.astype(dtype)[..., None]
         drive = apply(params, lambda m, a: m.gru.drive(a), prev_action.astype(dtype) * keep)
         tokens = apply(params, nets.RSSM.read_tokens, heads.encode(params, obs))

@@ -15,7 +15,7 @@ from vawm.envs.mjx import physics
 from vawm.envs.mjx.physics import Physics
 from vawm.envs.mjx.task import Task
 from vawm.envs.protocol import Environment, EnvState
-from vawm.types import Array, EnvSpec, Key, TimeStep
+from vawm.types import Array, ArraySpec, EnvSpec, Key, TimeStep
 
 EPISODE_STEPS = 1000
 MAX_DRAWS = 1000  # dm_control gives up after as many collisions
@@ -44,8 +44,7 @@ def batch(
     low, high = np.asarray(host.actuator_ctrlrange, np.float32).T
     spec = EnvSpec(
         task=name,
-        obs_shape=obs_shape(task, blank),
-        obs_dtype="float32",
+        obs=obs_spec(task, blank),
         action_size=host.nu,
         discrete=False,
         num_envs=num_envs,
@@ -230,10 +229,10 @@ def select(mask: Array, on_true, on_false):
     return on_true.replace(**fields)
 
 
-def obs_shape(task: Task, blank: mjx.Data) -> tuple[int, ...]:
-    """Shape of one observation, without computing one."""
+def obs_spec(task: Task, blank: mjx.Data) -> ArraySpec:
+    """Shape and dtype of one observation, without computing one."""
 
     def first_obs(key):
         return task.observe(blank, task.draw(key).target)
 
-    return jax.eval_shape(first_obs, jax.random.key(0)).shape
+    return jax.eval_shape(first_obs, jax.random.key(0))
