@@ -9,26 +9,15 @@ Every field of `vawm.config.Config` is a flag; `--help` lists them.
 
 from __future__ import annotations
 
-import pathlib
 import sys
 from collections.abc import Sequence
 
-from vawm import cache, command_line, huge_pages, runner
+from vawm import command_line, huge_pages
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Trains one agent; returns the exit code."""
-    arguments = command_line.parse(argv, preset="quick", description=__doc__)
-    runner.check(arguments.config, arguments.logdir, resume=arguments.resume)
-    cache.enable()
-    result = runner.run(
-        arguments.config,
-        arguments.logdir,
-        resume=arguments.resume,
-        banner=command_line.describe(arguments.config),
-        command=f"python {pathlib.Path(sys.argv[0])}",
-    )
-    return result.exit_code
+    return command_line.train(argv, suite="dmc_proprio", description=__doc__)
 
 
 if __name__ == "__main__":

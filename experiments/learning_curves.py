@@ -95,7 +95,7 @@ def check(options: Options) -> None:
       InvalidInput: names the option, its value and the remedy.
       RunError: a package is missing.
     """
-    config = validate.preset(options.preset)
+    config = validate.preset("dmc_proprio", options.preset)
     if options.env_steps is not None:
         config = dataclasses.replace(config, env_steps=options.env_steps)
     for seed in options.seeds:

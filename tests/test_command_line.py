@@ -16,7 +16,7 @@ EXPERIMENT = pathlib.Path(__file__).parents[1] / "experiments" / "dmc_proprio.py
 
 
 def parse(*flags):
-    return command_line.parse(flags, preset="quick", description="")
+    return command_line.parse(flags, suite="dmc_proprio", description="")
 
 
 UNUSUAL = config_lib.with_size(tiny.config(task="walker_run", preset="quick", seed=7), "1m")
@@ -87,8 +87,8 @@ def test_every_field_of_the_config_is_a_flag(capsys):
 def test_a_run_gets_a_folder_of_its_own():
     assert parse("--logdir", "here").logdir == pathlib.Path("here")
     parts = parse("--task", "walker_walk", "--seed", "2").logdir.parts
-    assert parts[:2] == ("runs", "walker_walk")
-    assert parts[2].startswith("quick-seed2-")
+    assert parts[:3] == ("runs", "dmc_proprio", "walker_walk")
+    assert parts[3].startswith("quick-seed2-")
 
 
 @pytest.mark.parametrize(
@@ -124,7 +124,10 @@ def test_the_preset_says_what_it_is(experiment, capsys):
     quick = config_lib.QUICK
     assert experiment() == 0
     text = capsys.readouterr().out
-    assert f"preset quick: {quick.task}, {quick.env_steps:,} env steps, size 1m" in text
+    assert (
+        f"preset quick: dmc_proprio {quick.task}, {quick.env_steps:,} env steps, size 1m"
+        in text
+    )
     assert "not the paper's setting" in text
     warmup = quick.value_alignment.warmup_steps
     assert f"value alignment: active after {warmup:,} env steps, for 94 % of the run" in text
@@ -132,7 +135,7 @@ def test_the_preset_says_what_it_is(experiment, capsys):
     assert "--preset paper" in text
 
 
-@pytest.mark.parametrize("preset", config_lib.PRESETS)
+@pytest.mark.parametrize("preset", ["quick", "paper"])
 def test_value_alignment_that_is_off_is_called_off(preset):
     text = command_line.describe(
         parse("--preset", preset, "--value-alignment.weight", "off").config

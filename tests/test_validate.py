@@ -9,8 +9,14 @@ import tiny
 from vawm import config as config_lib
 from vawm import validate
 from vawm.errors import InvalidInput
+from vawm.types import image
 
-NUMBERS = [name for name, _, kind in validate.fields(tiny.CONFIG) if kind in (int, float)]
+
+def numbers(config):
+    return [name for name, _, kind in validate.fields(config) if kind in (int, float)]
+
+
+NUMBERS = numbers(tiny.CONFIG)
 
 
 def changed(name, value, config=tiny.CONFIG):
@@ -21,24 +27,46 @@ def changed(name, value, config=tiny.CONFIG):
     return dataclasses.replace(config, **{head: value})
 
 
-@pytest.mark.parametrize("preset", config_lib.PRESETS)
+PRESETS = [(suite, name) for suite, presets in config_lib.PRESETS.items() for name in presets]
+
+
+@pytest.mark.parametrize(("suite", "preset"), PRESETS)
 @pytest.mark.parametrize("size", config_lib.SIZES)
-def test_every_preset_is_valid_at_every_size(preset, size):
-    validate.check(validate.preset(preset, size))
+def test_every_preset_is_valid_at_every_size(suite, preset, size):
+    config = validate.preset(suite, preset, size)
+    validate.check(config)
+    assert (config.suite, config.preset, config.size) == (suite, preset, size)
 
 
 @pytest.mark.parametrize("name", NUMBERS)
 @pytest.mark.parametrize("value", [-1, math.nan, math.inf, True, "3"])
 def test_every_number_is_checked(name, value):
+    assert_refused(tiny.CONFIG, name, value)
+
+
+def assert_refused(config, name, value):
     with pytest.raises(InvalidInput) as error:
-        validate.check(changed(name, value))
+        validate.check(changed(name, value, config))
     assert error.value.field == name
     assert str(error.value).startswith(f"{name}={value!r}: ")
     assert "\n" not in str(error.value)
 
 
+def quick(suite):
+    return config_lib.PRESETS[suite]["quick"]
+
+
+@pytest.mark.parametrize("suite", config_lib.ENV_CONFIGS)
+def test_every_number_of_an_environment_is_checked(suite):
+    for name in numbers(quick(suite)):
+        if name.startswith("env."):
+            for value in (-2, math.nan, True, "3"):
+                assert_refused(quick(suite), name, value)
+
+
 def test_every_rule_is_about_a_field():
-    assert set(validate.RULES) <= set(NUMBERS)
+    names = set().union(*(numbers(quick(suite)) for suite in config_lib.PRESETS))
+    assert set(validate.RULES) <= names
 
 
 @pytest.mark.parametrize(
@@ -91,9 +119,9 @@ def test_the_smallest_value_that_is_named_is_accepted(name, value):
     validate.check(changed(name, value))
 
 
-@pytest.mark.parametrize("preset", config_lib.PRESETS)
-def test_a_batch_larger_than_replay_is_blamed_and_a_smaller_one_named(preset):
-    config = config_lib.PRESETS[preset]
+@pytest.mark.parametrize(("suite", "preset"), PRESETS)
+def test_a_batch_larger_than_replay_is_blamed_and_a_smaller_one_named(suite, preset):
+    config = config_lib.PRESETS[suite][preset]
     with pytest.raises(InvalidInput, match="does not fit into") as error:
         validate.check(changed("replay.batch_size", 100_000, config))
     assert error.value.field == "replay.batch_size"
@@ -131,6 +159,7 @@ def test_a_config_of_no_known_size_or_preset_is_refused(config, message):
         (changed("world_model.hidden", 65, QUICK), "world_model.hidden=64, not 65"),
         (changed("world_model.classes", 5, QUICK), "world_model.classes=4, not 5"),
         (changed("world_model.units", 65, QUICK), "world_model.units=64, not 65"),
+        (changed("world_model.depth", 8, QUICK), "world_model.depth=4, not 8"),
         (changed("actor.units", 65, QUICK), "actor.units=64, not 65"),
         (changed("critic.units", 65, QUICK), "critic.units=64, not 65"),
     ],
@@ -145,6 +174,55 @@ def test_a_size_with_widths_of_another_is_refused(config, width):
 
 def test_unknown_presets_and_sizes_come_with_a_suggestion():
     with pytest.raises(InvalidInput, match="preset='papr': did you mean 'paper'"):
-        validate.preset("papr")
+        validate.preset("dmc_proprio", "papr")
     with pytest.raises(InvalidInput, match="size='12': did you mean '12m'"):
-        validate.preset("quick", "12")
+        validate.preset("dmc_proprio", "quick", "12")
+    with pytest.raises(InvalidInput, match="suite='atari': did you mean 'atari100k'"):
+        validate.preset("atari", "quick")
+
+
+ATARI, VISION = quick("atari100k"), quick("dmc_vision")
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        (changed("env.pooling", 5, ATARI), "env.pooling=5: use at most action_repeat=4"),
+        (changed("env.image_size", 60, ATARI), "env.image_size=60: use a multiple of 16"),
+        (changed("env.image_size", 512, VISION), "env.image_size=512: use a multiple of 16"),
+        (changed("env.sticky", 1.0, ATARI), "env.sticky=1.0: use a number from 0 up to"),
+        (changed("env.resize", "cubic", ATARI), "env.resize='cubic': .*use one of bilinear"),
+        (changed("action_repeat", 3, VISION), "action_repeat=3: use a divisor of 1000"),
+        (changed("action_repeat", 2, quick("gymnasium")), "action_repeat=2: use 1"),
+        (changed("suite", "atari100k", VISION), "env='VisionConfig': suite atari100k takes"),
+        (changed("suite", "atari", ATARI), "suite='atari': did you mean 'atari100k'"),
+        (changed("video.context", 32, VISION), "video.context=32: use less than replay.batch"),
+        (
+            changed("size", "custom", changed("world_model.depth", 3, ATARI)),
+            "world_model.depth=3: use one of which 4 times is a multiple of .*blocks=8",
+        ),
+        (changed("replay.images", "host"), "replay.images='host': there are no images"),
+        (changed("video.every", 10), "video.every=10: there are no images"),
+    ],
+)
+def test_what_a_suite_does_not_allow_is_refused(config, message):
+    with pytest.raises(InvalidInput, match=message):
+        validate.check(config)
+
+
+def test_a_frame_skip_need_not_divide_an_episode():
+    validate.check(changed("action_repeat", 3, ATARI))
+
+
+def test_environments_that_are_not_what_the_config_says_are_refused():
+    spec = tiny.env().spec
+    validate.check_spec(tiny.CONFIG, spec)
+    with pytest.raises(InvalidInput, match="num_envs=2: the environments have 3; use that"):
+        validate.check_spec(tiny.CONFIG, spec._replace(num_envs=3))
+    with pytest.raises(InvalidInput, match="action_repeat=1: the environments have 2"):
+        validate.check_spec(tiny.CONFIG, spec._replace(action_repeat=2))
+    pixels = changed("replay.images", "host", quick("gymnasium"))
+    spec = spec._replace(num_envs=pixels.num_envs)
+    with pytest.raises(InvalidInput, match="no images in these observations"):
+        validate.check_spec(pixels, spec)
+    validate.check_spec(pixels, spec._replace(obs={"a": spec.obs, "b": image(64)}))

@@ -13,16 +13,17 @@ import dataclasses
 import datetime
 import pathlib
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, NamedTuple
 
 import tyro
 
+from vawm import cache, resume, runner, validate
 from vawm import config as config_lib
 from vawm import flags as flags_lib
-from vawm import resume, validate
 from vawm.checkpoint import SaveError
 from vawm.config import Config
+from vawm.envs.protocol import EnvironmentFailure
 from vawm.errors import InvalidInput
 from vawm.runner import RunError
 
@@ -46,21 +47,67 @@ class Flags:
     """continue the run in --logdir, with its own settings as defaults"""
 
 
-def parse(argv: Sequence[str] | None, *, preset: str, description: str) -> Arguments:
-    """Reads `argv` (of the process if None); `preset` is the default one.
+def train(
+    argv: Sequence[str] | None,
+    *,
+    suite: str,
+    description: str,
+    aliases: Mapping[str, str] | None = None,
+) -> int:
+    """What an experiment does: reads its command line and trains; returns the exit code."""
+    arguments = parse(argv, suite=suite, description=description, aliases=aliases)
+    runner.check(arguments.config, arguments.logdir, resume=arguments.resume)
+    cache.enable()
+    result = runner.run(
+        arguments.config,
+        arguments.logdir,
+        resume=arguments.resume,
+        banner=describe(arguments.config),
+        command=f"python {pathlib.Path(sys.argv[0])}",
+    )
+    return result.exit_code
+
+
+def parse(
+    argv: Sequence[str] | None,
+    *,
+    suite: str,
+    description: str,
+    preset: str = "quick",
+    aliases: Mapping[str, str] | None = None,
+) -> Arguments:
+    """Reads `argv` (of the process if None).
+
+    Args:
+      argv: the words after the program's name.
+      suite: whose presets there are to choose from.
+      description: for the help.
+      preset: the default one.
+      aliases: flag -> the flag that it stands for.
 
     Raises:
-      InvalidInput: an unknown preset, size or flag, a wrong type, or nothing to resume.
+      InvalidInput: an unknown preset, size or flag, a wrong type, nothing to resume, or a
+        run of another suite.
       SystemExit: help was asked for (0).
     """
     argv = list(sys.argv[1:] if argv is None else argv)
-    default = Flags(_defaults(argv, preset))
+    argv = [_without_alias(word, aliases or {}) for word in argv]
+    default = Flags(_defaults(argv, suite, preset))
     flags = flags_lib.read(Flags, argv, default=default, description=description)
     config = _with_its_size(flags.config)
+    if config.suite != suite:
+        remedy = f"this program runs suite {suite}; use the one of that suite"
+        raise InvalidInput("suite", config.suite, remedy)
     return Arguments(config, flags.logdir or default_logdir(config), flags.resume)
 
 
-def _defaults(argv: list[str], preset: str) -> Config:
+def _without_alias(word: str, aliases: Mapping[str, str]) -> str:
+    """`--game` or `--game=breakout` as `--task` or `--task=breakout`."""
+    flag, equals, value = word.partition("=")
+    return aliases.get(flag, flag) + equals + value
+
+
+def _defaults(argv: list[str], suite: str, preset: str) -> Config:
     """First phase: the config that the flags of the second override."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     parser.add_argument("--preset", nargs="?")
@@ -74,7 +121,8 @@ def _defaults(argv: list[str], preset: str) -> Config:
         raise InvalidInput("--resume", True, "takes no value; write --resume alone") from None
     if not known.resume or {"-h", "--help"} & set(argv):
         size = None if known.size == config_lib.CUSTOM else known.size
-        return _with_its_warmup(validate.preset(known.preset or preset, size), known.env_steps)
+        config = validate.preset(suite, known.preset or preset, size)
+        return _with_its_warmup(config, known.env_steps)
     if known.logdir is None:
         raise InvalidInput("logdir", None, "--resume needs the --logdir of the run")
     saved = resume.saved_config(known.logdir)
@@ -92,13 +140,14 @@ def _with_its_warmup(config: Config, env_steps: str | None) -> Config:
         return config
     if config.preset != "quick":
         return config
-    alignment = dataclasses.replace(config.value_alignment, warmup_steps=scaled_warmup(length))
+    warmup = scaled_warmup(config.suite, length)
+    alignment = dataclasses.replace(config.value_alignment, warmup_steps=warmup)
     return dataclasses.replace(config, value_alignment=alignment)
 
 
-def scaled_warmup(env_steps: int) -> int:
+def scaled_warmup(suite: str, env_steps: int) -> int:
     """The warm-up of preset quick, in env steps, for another length: the same share of it."""
-    quick = config_lib.QUICK
+    quick = config_lib.PRESETS[suite]["quick"]
     return quick.value_alignment.warmup_steps * env_steps // quick.env_steps
 
 
@@ -113,30 +162,36 @@ def _with_its_size(config: Config) -> Config:
 def default_logdir(config: Config) -> pathlib.Path:
     """A folder of its own for each run."""
     now = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
-    return pathlib.Path("runs") / config.task / f"{config.preset}-seed{config.seed}-{now}"
+    name = f"{config.preset}-seed{config.seed}-{now}"
+    return pathlib.Path("runs") / config.suite / config.task.replace("/", "-") / name
 
 
 def describe(config: Config) -> str:
     """What the chosen preset is for, in a few lines."""
     head = (
-        f"preset {config.preset}: {config.task}, {config.env_steps:,} env steps, "
-        f"size {config.size}, seed {config.seed}"
+        f"preset {config.preset}: {config.suite} {config.task}, "
+        f"{config.env_steps:,} env steps, size {config.size}, seed {config.seed}"
     )
-    alignment, paper = _describe_alignment(config), config_lib.PAPER
+    alignment, paper = (
+        _describe_alignment(config),
+        config_lib.PRESETS[config.suite].get("paper"),
+    )
     if config.preset != "quick":
         return f"{head}\nvalue alignment: {alignment}"
-    return (
-        f"{head}\n"
-        "  for a CPU with 2 cores and some minutes; this is not the paper's setting\n"
-        f"  value alignment: {alignment}\n"
-        f"  the paper's setting: --preset paper ({paper.env_steps:,} env steps, "
-        f"size {paper.size}, better on a GPU)"
-    )
+    lines = [head, "  for a CPU with 2 cores and some minutes; this is not the paper's setting"]
+    lines.append(f"  value alignment: {alignment}")
+    if paper:
+        lines.append(
+            f"  the paper's setting: --preset paper ({paper.env_steps:,} env steps, "
+            f"size {paper.size}, better on a GPU)"
+        )
+    return "\n".join(lines)
 
 
 def _describe_alignment(config: Config) -> str:
     """From when on value alignment is active, and for how much of the run."""
-    alignment, paper = config.value_alignment, config_lib.PAPER
+    presets, alignment = config_lib.PRESETS[config.suite], config.value_alignment
+    paper = presets.get("paper", config_lib.PAPER)
     if alignment.weight == "off":
         return "off"
     in_updates = alignment.warmup_unit == "updates"
@@ -151,7 +206,7 @@ def _describe_alignment(config: Config) -> str:
     share = f"{about}{percent} %" if percent else "less than 1 %"
     text = f"active after {warmup:,} {unit}, for {share} of the run"
     short = config.preset == "quick" and config.env_steps < paper.env_steps
-    if short and not in_updates and warmup == scaled_warmup(config.env_steps):
+    if short and not in_updates and warmup == scaled_warmup(config.suite, config.env_steps):
         scale = f"{paper.value_alignment.warmup_steps:,} of {paper.env_steps:,}"
         text += f"; the warm-up is scaled to the short run (paper: {scale})"
     return text
@@ -174,7 +229,7 @@ def guard(main: Callable[[], int]) -> int:
     except InvalidInput as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    except (RunError, SaveError) as error:
+    except (RunError, SaveError, EnvironmentFailure) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:

@@ -25,6 +25,8 @@ class WorldModelConfig:
     """classes of each categorical"""
     units: int = 256
     """width of encoder, decoder, reward and continue layers"""
+    depth: int = 16
+    """channels of the image encoder and decoder, whose stages have 2, 3, 4 and 4 times these"""
     blocks: int = 8
     """blocks of the block-diagonal GRU"""
     prior_layers: int = 2
@@ -53,6 +55,9 @@ class ActorConfig:
     scale: float = 1.0
     entropy_scale: float = 1e-3
     """Table 15; public DreamerV3 codes use 3e-4"""
+    collect_temperature: float = 1.0
+    """divides the logits of a discrete policy while it collects, never in a loss; 0.01 is
+    what IRIS does on Freeway, and the paper with it"""
 
 
 @dataclass(frozen=True)
@@ -125,6 +130,8 @@ class ReplayConfig:
     """steps of all environments together; never more than the run collects is allocated"""
     batch_size: int = 16
     batch_length: int = 64
+    images: Literal["device", "host"] = "device"
+    """where images are kept, as bytes; all else of replay is on the device"""
 
     @property
     def batch_steps(self) -> int:
@@ -133,10 +140,101 @@ class ReplayConfig:
 
 
 @dataclass(frozen=True)
+class VideoConfig:
+    """Videos of what the world model expects and of what the policy does, from images."""
+
+    every: int = 0
+    """env steps between videos; 0 for none"""
+    sequences: int = 4
+    """replayed sequences in a video of open-loop prediction, side by side"""
+    context: int = 5
+    """steps that the world model sees before it has to predict the rest of the sequence"""
+    episode_steps: int = 1_000
+    """steps of an episode that its video shows at most"""
+
+
+@dataclass(frozen=True)
+class EnvConfig:
+    """What a suite lets one choose of its environments: nothing, for the tasks on MJX."""
+
+
+@dataclass(frozen=True)
+class HostEnvConfig(EnvConfig):
+    """Environments outside of the device, stepped side by side in processes of their own."""
+
+    workers: int = 0
+    """processes; 0 for one per environment, but not more than there are cores"""
+    timeout: float = 60.0
+    """seconds that one step, or one reset, of an environment may take"""
+    on_failure: Literal["raise", "restart"] = "raise"
+    """when an environment raises, dies or hangs: end the run, or begin a new episode in it"""
+
+
+@dataclass(frozen=True)
+class AtariConfig(HostEnvConfig):
+    """Atari 100k as DreamerV3 plays it; the frame skip is `action_repeat`."""
+
+    image_size: int = 64
+    """pixels a side, RGB"""
+    resize: Literal["bilinear", "area"] = "bilinear"
+    """bilinear: Pillow's, as in DreamerV3; area: OpenCV's, as in IRIS, STORM and ALE's own"""
+    pooling: int = 2
+    """frames at the end of a skip of which the maximum is seen"""
+    noops: int = 30
+    """random number of no-ops, up to this, that an episode begins with"""
+    sticky: float = 0.0
+    """probability that a frame repeats the action before instead; 0.25 in ALE's v5"""
+    life_loss: Literal["ignore", "terminal", "end"] = "ignore"
+    """terminal: the return ends there, the episode goes on; end: the episode ends too, and
+    a new game begins"""
+    clip_reward: bool = False
+    """to its sign"""
+    max_frames: int = 108_000
+    """of a game, which then is cut short and not terminal"""
+    full_action_set: bool = False
+    """all 18 actions instead of those that do something in the game"""
+
+
+@dataclass(frozen=True)
+class VisionConfig(HostEnvConfig):
+    """DeepMind Control from pixels, rendered by dm_control."""
+
+    image_size: int = 64
+    """pixels a side, RGB"""
+    camera: int = -1
+    """-1 for the usual one: 2 for quadruped, 0 for all others"""
+    renderer: Literal["auto", "egl", "osmesa"] = "auto"
+    """auto: EGL where it works, else OSMesa"""
+    fast_rendering: bool = False
+    """no shadows, reflections and anti-aliasing: other pixels, several times as fast"""
+
+
+@dataclass(frozen=True)
+class GymnasiumConfig(HostEnvConfig):
+    """Any registered Gymnasium environment; the task is its id."""
+
+    time_limit: int = 0
+    """steps after which an episode is truncated; 0 for the environment's own limit"""
+
+
+ENV_CONFIGS: dict[str, type[EnvConfig]] = {
+    "dmc_proprio": EnvConfig,
+    "dmc_vision": VisionConfig,
+    "atari100k": AtariConfig,
+    "gymnasium": GymnasiumConfig,
+}
+"""Suite -> what can be chosen of its environments."""
+
+
+@dataclass(frozen=True)
 class Config:
     """One run. `env_steps` counts control steps, action repeat included."""
 
+    suite: Literal["dmc_proprio", "dmc_vision", "atari100k", "gymnasium"] = "dmc_proprio"
+    """where the task is from"""
     task: str = "cartpole_swingup"
+    agent: Literal["dreamerv3"] = "dreamerv3"
+    """which world model imagines"""
     preset: str = "paper"
     """where the other numbers come from: an entry of `PRESETS`, or custom"""
     size: str = "12m"
@@ -162,6 +260,8 @@ class Config:
     value_alignment: ValueAlignmentConfig = field(default_factory=ValueAlignmentConfig)
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     replay: ReplayConfig = field(default_factory=ReplayConfig)
+    video: VideoConfig = field(default_factory=VideoConfig)
+    env: EnvConfig = field(default_factory=EnvConfig)
 
 
 CUSTOM = "custom"
@@ -176,16 +276,17 @@ class Size:
     hidden: int
     classes: int
     units: int
+    depth: int
 
 
 SIZES = {
-    "1m": Size(deter=512, hidden=64, classes=4, units=64),
-    "12m": Size(deter=2048, hidden=256, classes=16, units=256),
-    "25m": Size(deter=3072, hidden=384, classes=24, units=384),
-    "50m": Size(deter=4096, hidden=512, classes=32, units=512),
-    "100m": Size(deter=6144, hidden=768, classes=48, units=768),
-    "200m": Size(deter=8192, hidden=1024, classes=64, units=1024),
-    "400m": Size(deter=12288, hidden=1536, classes=96, units=1536),
+    "1m": Size(deter=512, hidden=64, classes=4, units=64, depth=4),
+    "12m": Size(deter=2048, hidden=256, classes=16, units=256, depth=16),
+    "25m": Size(deter=3072, hidden=384, classes=24, units=384, depth=24),
+    "50m": Size(deter=4096, hidden=512, classes=32, units=512, depth=32),
+    "100m": Size(deter=6144, hidden=768, classes=48, units=768, depth=48),
+    "200m": Size(deter=8192, hidden=1024, classes=64, units=1024, depth=64),
+    "400m": Size(deter=12288, hidden=1536, classes=96, units=1536, depth=96),
 }
 
 
@@ -201,6 +302,7 @@ def with_size(config: Config, size: str) -> Config:
             hidden=widths.hidden,
             classes=widths.classes,
             units=widths.units,
+            depth=widths.depth,
         ),
         actor=dataclasses.replace(config.actor, units=widths.units),
         critic=dataclasses.replace(config.critic, units=widths.units),
@@ -226,7 +328,82 @@ QUICK = dataclasses.replace(
 """For a CPU with 2 cores: steps in the simulation cost little there and updates much, so it
 takes few small updates at a high learning rate, and long actions."""
 
-PRESETS = {"quick": QUICK, "paper": PAPER}
+VISION_PAPER = dataclasses.replace(
+    PAPER,
+    suite="dmc_vision",
+    task="walker_walk",
+    env_steps=1_000_000,
+    video=VideoConfig(every=50_000),
+    env=VisionConfig(),
+)
+"""DMC vision; batch, train ratio and action repeat as for the proprio tasks."""
+
+VISION_QUICK = dataclasses.replace(
+    VISION_PAPER,
+    **{
+        name: getattr(QUICK, name)
+        for name in (
+            *("preset", "size", "num_envs", "action_repeat", "train_ratio", "log_every"),
+            *("world_model", "actor", "critic", "imagination", "optimizer", "replay"),
+        )
+    },
+    task="cartpole_balance",
+    env_steps=60_000,
+    save_every=12_000,
+    value_alignment=ValueAlignmentConfig(warmup_steps=3_600),
+    video=VideoConfig(every=20_000),
+)
+
+ATARI_PAPER = dataclasses.replace(
+    PAPER,
+    suite="atari100k",
+    task="breakout",
+    env_steps=400_000,
+    num_envs=1,
+    action_repeat=4,
+    train_ratio=256,
+    save_every=40_000,
+    value_alignment=ValueAlignmentConfig(warmup_steps=40_000),
+    video=VideoConfig(every=40_000),
+    env=AtariConfig(),
+)
+"""100,000 agent steps of 4 frames each; the warm-up is 10,000 of them, since the paper's text
+calls the agent's steps training steps. The train ratio is the official code's."""
+
+ATARI_QUICK = dataclasses.replace(
+    ATARI_PAPER,
+    **{
+        name: getattr(QUICK, name)
+        for name in (
+            *("preset", "size", "log_every", "world_model", "actor", "critic"),
+            *("imagination", "optimizer", "replay"),
+        )
+    },
+    env_steps=80_000,
+    save_every=16_000,
+    train_ratio=32,
+    value_alignment=ValueAlignmentConfig(warmup_steps=8_000),
+    video=VideoConfig(every=20_000),
+)
+
+GYMNASIUM_QUICK = dataclasses.replace(
+    QUICK,
+    suite="gymnasium",
+    task="CartPole-v1",
+    action_repeat=1,
+    env_steps=30_000,
+    save_every=6_000,
+    value_alignment=ValueAlignmentConfig(warmup_steps=1_800),
+    env=GymnasiumConfig(),
+)
+
+PRESETS = {
+    "dmc_proprio": {"quick": QUICK, "paper": PAPER},
+    "dmc_vision": {"quick": VISION_QUICK, "paper": VISION_PAPER},
+    "atari100k": {"quick": ATARI_QUICK, "paper": ATARI_PAPER},
+    "gymnasium": {"quick": GYMNASIUM_QUICK},
+}
+"""Suite -> name -> config."""
 
 
 def as_dict(config: Config) -> dict[str, Any]:

@@ -45,20 +45,25 @@ def read(
     except SystemExit as error:
         if not error.code:
             raise
-        raise _bad_value(box.getvalue(), argv, known(cls)) from None
+        raise _bad_value(box.getvalue(), argv, known(cls, default)) from None
     if unknown:
-        raise _unknown(unknown, known(cls))
+        raise _unknown(unknown, known(cls, default))
     return result
 
 
-def known(cls: type, prefix: str = "") -> dict[str, Any]:
-    """Flag -> type, for every field; those of `config: Config` have no prefix."""
+def known(cls: type, default: Any = None, prefix: str = "") -> dict[str, Any]:
+    """Flag -> type, for every field; those of `config: Config` have no prefix.
+
+    Where `default` holds a subclass of what a field is declared as, its fields count.
+    """
     hints = typing.get_type_hints(cls)
     result: dict[str, Any] = {}
     for field in dataclasses.fields(cls):
         name, kind = prefix + field.name, hints[field.name]
+        value = getattr(default, field.name, None)
         if dataclasses.is_dataclass(kind):
-            result |= known(typing.cast(type, kind), "" if name == "config" else name + ".")
+            inner = typing.cast(type, kind) if value is None else type(value)
+            result |= known(inner, value, "" if name == "config" else name + ".")
         else:
             result[_dashed("--" + name)] = kind
     return result

@@ -9,10 +9,14 @@ import typing
 from collections.abc import Callable, Collection, Iterator
 from typing import Any
 
+import jax
+
 from vawm import config as config_lib
-from vawm.config import Config
+from vawm.config import AtariConfig, Config, VisionConfig
 from vawm.envs import EPISODE_STEPS
 from vawm.errors import InvalidInput
+from vawm.types import EnvSpec, is_image
+from vawm.world_model.heads import check_image_size
 
 Rule = tuple[Callable[[Any], bool], str]
 
@@ -39,6 +43,11 @@ RULES: dict[str, Rule] = {
     "actor.unimix": BELOW_ONE,
     "actor.scale": NOT_NEGATIVE,
     "actor.entropy_scale": NOT_NEGATIVE,
+    "env.camera": (lambda x: x >= -1, "use the number of a camera, or -1 for the usual one"),
+    "env.noops": NOT_NEGATIVE,
+    "env.sticky": BELOW_ONE,
+    "env.time_limit": NOT_NEGATIVE,
+    "env.workers": NOT_NEGATIVE,
     "critic.bins": BINS,
     "critic.scale": NOT_NEGATIVE,
     "critic.slow_rate": RATE,
@@ -57,6 +66,7 @@ RULES: dict[str, Rule] = {
     "optimizer.warmup_updates": NOT_NEGATIVE,
     "optimizer.beta1": BELOW_ONE,
     "optimizer.beta2": BELOW_ONE,
+    "video.every": NOT_NEGATIVE,
 }
 """Every other number has to be positive."""
 
@@ -121,9 +131,7 @@ def _check_together(config: Config) -> None:
     _check_widths(config)
     _check_replay(config)
     _check_counters(config)
-    if EPISODE_STEPS % config.action_repeat:
-        remedy = f"use a divisor of {EPISODE_STEPS}, the control steps of an episode"
-        raise InvalidInput("action_repeat", config.action_repeat, remedy)
+    _check_env(config)
     if config.actor.min_std > config.actor.max_std:
         remedy = f"use at most actor.max_std={config.actor.max_std}"
         raise InvalidInput("actor.min_std", config.actor.min_std, remedy)
@@ -135,7 +143,8 @@ def _check_together(config: Config) -> None:
 
 def _check_names(config: Config) -> None:
     """Preset and size are known, and a size is not the name of other widths than its own."""
-    check_choice("preset", config.preset, [*config_lib.PRESETS, config_lib.CUSTOM])
+    presets = config_lib.PRESETS[config.suite]
+    check_choice("preset", config.preset, [*presets, config_lib.CUSTOM])
     check_choice("size", config.size, [*config_lib.SIZES, config_lib.CUSTOM])
     if config.size == config_lib.CUSTOM:
         return
@@ -150,27 +159,33 @@ def _check_names(config: Config) -> None:
 
 
 def _check_widths(config: Config) -> None:
-    deter, blocks = config.world_model.deter, config.world_model.blocks
-    if deter % blocks:
-        remedy = f"use a multiple of world_model.blocks={blocks}"
-        raise InvalidInput("world_model.deter", deter, remedy)
+    model = config.world_model
+    if model.deter % model.blocks:
+        remedy = f"use a multiple of world_model.blocks={model.blocks}"
+        raise InvalidInput("world_model.deter", model.deter, remedy)
+    if 4 * model.depth % model.blocks:  # channels of the map that the decoder starts from
+        remedy = f"use one of which 4 times is a multiple of world_model.blocks={model.blocks}"
+        raise InvalidInput("world_model.depth", model.depth, remedy)
+
+
+def _first_update(config: Config) -> int:
+    """Steps of each environment that replay holds when learning starts.
+
+    That is as soon as there are as many sequences to draw as a batch has steps.
+    """
+    return config.replay.batch_length + -(-config.replay.batch_steps // config.num_envs)
 
 
 def smallest_replay(config: Config) -> int:
-    """The least `replay.capacity` that can fill a batch and hold a chunk.
-
-    Learning starts when replay holds as many sequences as a batch has steps.
-    """
-    replay = config.replay
-    needed = replay.batch_length + -(-replay.batch_steps // config.num_envs)
-    return max(needed, config.collect_steps) * config.num_envs
+    """The least `replay.capacity` that can fill a batch and hold a chunk."""
+    return max(_first_update(config), config.collect_steps) * config.num_envs
 
 
 def _check_replay(config: Config) -> None:
     """Replay can fill a batch, and the run lasts long enough for that."""
     replay, num_envs = config.replay, config.num_envs
     batches = f"smaller batches than {replay.batch_size} x {replay.batch_length}"
-    needed = replay.batch_length + -(-replay.batch_steps // num_envs)  # in each environment
+    needed = _first_update(config)
     needed_env_steps = needed * num_envs * config.action_repeat
     fits = replay.capacity // num_envs >= needed
     if not (fits and config.env_steps >= needed_env_steps):
@@ -191,6 +206,11 @@ def _check_replay(config: Config) -> None:
         raise InvalidInput("env_steps", config.env_steps, remedy)
 
 
+def _usual(config: Config) -> Config:
+    """The preset of this run; that of the paper where it has none of its own."""
+    return config_lib.PRESETS[config.suite].get(config.preset, config_lib.PAPER)
+
+
 def _blame_batch(config: Config) -> None:
     """Refuses a batch larger than the preset's for what replay gets to hold.
 
@@ -198,7 +218,7 @@ def _blame_batch(config: Config) -> None:
       InvalidInput: with the largest batch that would do; not for a batch of usual size.
     """
     replay, num_envs = config.replay, config.num_envs
-    usual = config_lib.PRESETS.get(config.preset, config_lib.PAPER).replay
+    usual = _usual(config).replay
     if replay.batch_steps <= usual.batch_steps:
         return
     held = min(replay.capacity, config.env_steps // config.action_repeat) // num_envs
@@ -222,7 +242,7 @@ def _blame_envs(config: Config, needed: int) -> None:
       InvalidInput: with a number that would do; not for a usual number, nor if a single
         environment were too many.
     """
-    usual = config_lib.PRESETS.get(config.preset, config_lib.PAPER).num_envs
+    usual = _usual(config).num_envs
     held = min(config.replay.capacity, config.env_steps // config.action_repeat)
     # n environments need n * (L + ceil(B * L / n)), which is below n * (L + 1) + B * L.
     enough = (held - config.replay.batch_steps) // (config.replay.batch_length + 1)
@@ -248,10 +268,66 @@ def _check_counters(config: Config) -> None:
     raise InvalidInput("collect_steps", config.collect_steps, remedy)
 
 
-def preset(name: str, size: str | None = None) -> Config:
+def _check_env(config: Config) -> None:
+    """What a suite allows: its own choices, its action repeat, its images."""
+    kind = config_lib.ENV_CONFIGS[config.suite]
+    if type(config.env) is not kind:
+        remedy = f"suite {config.suite} takes a {kind.__name__}"
+        raise InvalidInput("env", type(config.env).__name__, remedy)
+    repeat, sequence = config.action_repeat, config.replay.batch_length
+    if config.suite.startswith("dmc") and EPISODE_STEPS % repeat:
+        remedy = f"use a divisor of {EPISODE_STEPS}, the control steps of an episode"
+        raise InvalidInput("action_repeat", repeat, remedy)
+    if config.suite == "gymnasium" and repeat != 1:
+        remedy = "use 1: a Gymnasium environment repeats actions itself, or not at all"
+        raise InvalidInput("action_repeat", repeat, remedy)
+    if isinstance(config.env, AtariConfig) and config.env.pooling > repeat:
+        remedy = f"use at most action_repeat={repeat}, the frames of a step"
+        raise InvalidInput("env.pooling", config.env.pooling, remedy)
+    if isinstance(config.env, AtariConfig | VisionConfig):
+        check_image_size("env.image_size", config.env.image_size)
+    if config.video.every and config.video.context >= sequence:
+        remedy = f"use less than replay.batch_length={sequence}, or nothing is left to predict"
+        raise InvalidInput("video.context", config.video.context, remedy)
+    if config.suite == "dmc_proprio":
+        check_images(config, present=False)
+
+
+def check_spec(config: Config, spec: EnvSpec) -> None:
+    """Refuses environments that are not what the config says of them.
+
+    Raises:
+      InvalidInput: their number, their action repeat, or choices for images they do not have.
+    """
+    for name in ("num_envs", "action_repeat"):
+        if getattr(config, name) != getattr(spec, name):
+            remedy = f"the environments have {getattr(spec, name)}; use that"
+            raise InvalidInput(name, getattr(config, name), remedy)
+    check_images(config, present=any(map(is_image, jax.tree.leaves(spec.obs))))
+
+
+def check_images(config: Config, *, present: bool) -> None:
+    """Refuses what only makes sense for images where observations have none.
+
+    Raises:
+      InvalidInput: replay is to keep images on the host, or videos are to be made.
+    """
+    if present:
+        return
+    if config.replay.images == "host":
+        remedy = "there are no images in these observations; use 'device'"
+        raise InvalidInput("replay.images", config.replay.images, remedy)
+    if config.video.every:
+        remedy = "there are no images in these observations; use 0"
+        raise InvalidInput("video.every", config.video.every, remedy)
+
+
+def preset(suite: str, name: str, size: str | None = None) -> Config:
     """The config of a preset, at another size where one is given."""
-    check_choice("preset", name, config_lib.PRESETS)
+    check_choice("suite", suite, config_lib.PRESETS)
+    presets = config_lib.PRESETS[suite]
+    check_choice("preset", name, presets)
     if size is None:
-        return config_lib.PRESETS[name]
+        return presets[name]
     check_choice("size", size, config_lib.SIZES)
-    return config_lib.with_size(config_lib.PRESETS[name], size)
+    return config_lib.with_size(presets[name], size)
