@@ -11,8 +11,9 @@ import scalar_agent
 from scalar_agent import AGENT, CONFIG, PARAMS
 from test_returns import slow_lambda_returns, slow_replay_returns
 
-from vawm import objective, returns, train
+from vawm import objective, returns
 from vawm.config import ValueAlignmentConfig
+from vawm.learner import init_learner, make_update
 from vawm.types import Trajectory
 
 B, T, H = CONFIG.replay.batch_size, CONFIG.replay.batch_length, CONFIG.imagination.horizon
@@ -225,12 +226,12 @@ def test_with_critic_slow_alignment_is_that_of_the_slow_parameters():
 def compiled_update():
     alignment = ValueAlignmentConfig(warmup_steps=24, warmup_unit="updates")
     config = dataclasses.replace(CONFIG, value_alignment=alignment)
-    return jax.jit(train.make_update(AGENT, config))
+    return jax.jit(make_update(AGENT, config))
 
 
 @pytest.mark.parametrize(("updates", "env_steps", "opens"), [(24, 10**6, False), (25, 0, True)])
 def test_counted_in_updates_the_warmup_ignores_env_steps(updates, env_steps, opens):
-    learner = train.init_learner(AGENT, CONFIG, jax.random.key(0))
+    learner = init_learner(AGENT, CONFIG, jax.random.key(0))
     learner = learner._replace(step=jnp.asarray(updates))
     _, _, metrics = compiled_update()(
         learner, batch(), jax.random.key(0), jnp.asarray(env_steps)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from vawm import replay
-from vawm.types import EnvSpec, Latent, Trajectory
+from vawm.types import EnvSpec, Latent, Trajectory, vector
 
 CLASSES = 3
 
@@ -36,7 +36,8 @@ def filled(num_envs, capacity, chunks):
 
 
 def draw(buffer, key, batch_size, length):
-    return replay.sample(buffer, key, batch_size=batch_size, length=length, classes=CLASSES)
+    positions = replay.draw(buffer, key, batch_size=batch_size, length=length)
+    return *replay.read(buffer, positions, classes=CLASSES), positions
 
 
 @pytest.mark.parametrize("chunks", [[4], [4, 4, 4], [3, 5, 5], [7, 7, 7, 7]])
@@ -110,7 +111,7 @@ def test_adding_more_steps_than_fit_is_refused():
 
 
 def test_capacity_is_shared_by_environments_and_bounded_by_the_run():
-    spec = EnvSpec("test", (1,), "float32", 1, False, 4, 5, 200)
+    spec = EnvSpec("test", vector(1), 1, False, 4, 5, 200)
 
     def capacity(env_steps, collect_steps=1):
         return replay.capacity_per_env(

@@ -15,6 +15,8 @@ from test_objective import batch
 
 from vawm import cache, train
 from vawm.agent import make_agent
+from vawm.collector import make_collect
+from vawm.learner import make_update
 
 QUICKLY = {"xla_backend_optimization_level": 0}  # each is compiled twice and run twice
 
@@ -74,8 +76,8 @@ def main():
         return x + jnp.asarray(0.1 * rng.normal(size=x.shape), x.dtype)
 
     learner = state.learner._replace(params=jax.tree.map(disturb, state.learner.params))
-    check_update(compiled(train.make_update(agent, config)), learner, batch(agent))
-    check_collect(compiled(train.make_collect(env, agent, config)), state)
+    check_update(compiled(make_update(agent, config)), learner, batch(agent))
+    check_collect(compiled(make_collect(env, agent, config)), state)
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ import tiny
 
 from vawm import envs, replay, train
 from vawm.agent import make_agent
+from vawm.learner import init_learner, make_learn
 from vawm.types import Trajectory
 
 
@@ -200,16 +201,16 @@ def scalar_experience():
 
 def test_latents_are_written_back_to_exactly_the_steps_they_were_inferred_at():
     agent, config = scalar_agent.AGENT, scalar_agent.CONFIG
-    learner = train.init_learner(agent, config, jax.random.key(0))
+    learner = init_learner(agent, config, jax.random.key(0))
     before, one = scalar_experience(), jnp.asarray(1)
-    learn = jax.jit(train.make_learn(agent, config))
+    learn = jax.jit(make_learn(agent, config))
     _, after, _ = learn(learner, before, jax.random.key(1), one, one)
 
     length = config.replay.batch_length + 1
-    sample = functools.partial(replay.sample, batch_size=2, length=length, classes=2)
+    draw = functools.partial(replay.draw, batch_size=2, length=length)
     key_draw = jax.random.split(jax.random.key(1), 3)[1]
-    drawn = jax.tree.map(np.asarray, jax.jit(sample)(before, key_draw))
-    trajectory, context, (env, time) = drawn
+    env, time = positions = jax.device_get(jax.jit(draw)(before, key_draw))
+    trajectory, context = jax.device_get(replay.read(before, positions, classes=2))
     assert env[0] != env[1]  # no step is in both samples
     deter, stoch = (np.array(x) for x in before.latent)
     for b in range(2):

@@ -8,10 +8,11 @@ the one at its first step, and the learner writes the latents that it infers bac
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from vawm.types import Array, EnvSpec, Key, Latent, Trajectory
 
@@ -24,10 +25,10 @@ class Replay(NamedTuple):
 
 
 class Positions(NamedTuple):
-    """Where a sample lies."""
+    """Where a sample lies; of jax or of numpy, by who drew it."""
 
-    env: Array  # [B]
-    time: Array  # [B, L]
+    env: Any  # [B] int32
+    time: Any  # [B, L] int32
 
 
 def capacity_per_env(
@@ -98,16 +99,10 @@ def num_starts(replay: Replay, length: int) -> Array:
     return num_envs * jnp.maximum(replay.size - length + 1, 0)
 
 
-def sample(
-    replay: Replay, key: Key, *, batch_size: int, length: int, classes: int
-) -> tuple[Trajectory, Latent, Positions]:
-    """Draw `batch_size` runs of `length` steps, uniformly over all possible starts.
+def draw(replay: Replay, key: Key, *, batch_size: int, length: int) -> Positions:
+    """`batch_size` runs of `length` steps, uniformly over all possible starts.
 
     Needs `num_starts(replay, length) > 0`.
-
-    Returns:
-      The trajectories `[B, L, ...]`, the stored latents of their first steps `[B, ...]`,
-      and where they lie, for `write_back`.
     """
     num_envs, capacity = replay.trajectory.reward.shape
     key_env, key_start = jax.random.split(key)
@@ -115,12 +110,39 @@ def sample(
     start = jax.random.randint(key_start, (batch_size,), 0, replay.size - length + 1)
     oldest = replay.head - replay.size
     time = (oldest + start[:, None] + jnp.arange(length)[None, :]) % capacity
+    return Positions(env, time)
+
+
+def draw_on_host(
+    rng: np.random.Generator,
+    num_envs: int,
+    capacity: int,
+    head: int,
+    size: int,
+    *,
+    batch_size: int,
+    length: int,
+) -> Positions:
+    """As `draw`, with numpy and where replay is known by its numbers only."""
+    env = rng.integers(num_envs, size=batch_size)
+    start = rng.integers(size - length + 1, size=batch_size)
+    time = (head - size + start[:, None] + np.arange(length)[None, :]) % capacity
+    return Positions(env.astype(np.int32), time.astype(np.int32))
+
+
+def read(replay: Replay, positions: Positions, *, classes: int) -> tuple[Trajectory, Latent]:
+    """What lies at `positions`.
+
+    Returns:
+      The trajectories `[B, L, ...]` and the stored latents of their first steps `[B, ...]`.
+    """
+    env, time = positions
     trajectory = jax.tree.map(lambda x: x[env[:, None], time], replay.trajectory)
     context = jax.tree.map(lambda x: x[env, time[:, 0]], replay.latent)
     # An episode that a reset cut short has no last step of its own.
     abandoned = jnp.pad(trajectory.is_first[:, 1:], ((0, 0), (0, 1)))
     trajectory = trajectory._replace(is_last=trajectory.is_last | abandoned)
-    return trajectory, unpack(context, classes), Positions(env, time)
+    return trajectory, unpack(context, classes)
 
 
 def write_back(replay: Replay, positions: Positions, latent: Latent) -> Replay:

@@ -1,0 +1,115 @@
+"""Interaction: act, store what the action left from, take in what arrives.
+
+`depart` and `arrive` are the two halves of a step around an environment. `make_collect` puts
+a jittable environment between them; where environments run on the host, the host does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from vawm import replay
+from vawm.agent import Agent, PolicyCarry
+from vawm.config import Config
+from vawm.envs.protocol import Environment
+from vawm.replay import Replay
+from vawm.types import Array, Key, Latent, Metrics, Params, PyTree, TimeStep, Trajectory
+
+
+class Collector(NamedTuple):
+    """Everything that interaction changes, but for replay."""
+
+    env_state: PyTree
+    timestep: TimeStep  # the observation that waits for an action
+    carry: PolicyCarry
+    env_steps: Array  # [] int32, control steps so far, action repeat included
+    episode_return: Array  # [N] of the running episodes
+    episode_length: Array  # [N] calls of `step` in the running episodes
+
+
+class Departure(NamedTuple):
+    """What an action leaves behind: the step to store, and the latent inferred there."""
+
+    trajectory: Trajectory  # [N, ...]
+    latent: Latent  # [N, ...]
+
+
+Collect = Callable[[Params, Collector, Replay, Key], tuple[Collector, Replay, Metrics]]
+
+
+def depart(
+    agent: Agent, params: Params, collector: Collector, key: Key
+) -> tuple[Collector, Departure]:
+    """Acts on what has arrived. The action, `[N, A]`, is that of the departure."""
+    timestep = collector.timestep
+    carry, action = agent.act(params, key, collector.carry, timestep, how="collect")
+    stored = Departure(Trajectory(*timestep, action=action), carry.latent)
+    return collector._replace(carry=carry), stored
+
+
+def arrive(
+    collector: Collector, timestep: TimeStep, *, action_repeat: int
+) -> tuple[Collector, Metrics]:
+    """Takes in what an environment answered; `collector` has its new state already.
+
+    Metrics are sums over the episodes that ended in this step.
+    """
+    moved = ~timestep.is_first
+    episode_return = jnp.where(moved, collector.episode_return, 0.0) + timestep.reward
+    episode_length = jnp.where(moved, collector.episode_length + 1, 0)
+    ended = timestep.is_last
+    metrics = {
+        "episode/count": jnp.sum(ended),
+        "episode/return": jnp.sum(jnp.where(ended, episode_return, 0.0)),
+        "episode/length": jnp.sum(jnp.where(ended, episode_length, 0)),
+    }
+    return Collector(
+        env_state=collector.env_state,
+        timestep=timestep,
+        carry=collector.carry,
+        env_steps=collector.env_steps + action_repeat * jnp.sum(moved),
+        episode_return=episode_return,
+        episode_length=episode_length,
+    ), metrics
+
+
+def make_collect(env: Environment, agent: Agent, config: Config) -> Collect:
+    """Build `collect(params, collector, replay, key)`: K steps in each environment."""
+
+    def step(params: Params, collector: Collector, key: Key):
+        collector, stored = depart(agent, params, collector, key)
+        env_state, timestep = env.step(collector.env_state, stored.trajectory.action)
+        collector, metrics = arrive(
+            collector._replace(env_state=env_state),
+            timestep,
+            action_repeat=env.spec.action_repeat,
+        )
+        metrics["env/nonfinite"] = jnp.sum(timestep.is_last & (env_state.steps < 0))
+        return collector, (stored, metrics)
+
+    def collect(params: Params, collector: Collector, buffer: Replay, key: Key):
+        keys = jax.random.split(key, config.collect_steps)
+        collector, (stored, metrics) = jax.lax.scan(
+            lambda c, k: step(params, c, k), collector, keys
+        )
+        trajectory, latent = jax.tree.map(lambda x: x.swapaxes(0, 1), stored)
+        buffer = replay.add(buffer, trajectory, latent)
+        return collector, buffer, jax.tree.map(jnp.sum, metrics)
+
+    return collect
+
+
+def begin(agent: Agent, timestep: TimeStep, env_state: PyTree, *, num_envs: int) -> Collector:
+    """The collector before the first action; `timestep` are first observations."""
+    return Collector(
+        env_state=env_state,
+        timestep=timestep,
+        carry=agent.initial(num_envs),
+        env_steps=jnp.zeros((), jnp.int32),
+        episode_return=jnp.zeros(num_envs),
+        episode_length=jnp.zeros(num_envs, jnp.int32),
+    )
