@@ -1,0 +1,356 @@
+"""The process that runs some environments of a pool.
+
+A worker answers orders, one at a time: `(ticket, name, {environment: payload})` is carried
+out for one environment after the other by the method `name` of `Worker`. Actions,
+observations, rewards and flags are in memory of both. It knows nothing of streams or
+policies: the pool says when an episode begins and what follows a failure.
+
+It ends when the pool ends it, and with the pool's process, however that one ends.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import faulthandler
+import functools
+import json
+import os
+import pickle
+import signal
+import socket
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from vawm.envs.host.channel import Channel, Fields, view
+from vawm.envs.host.simulator import Outcome, Simulator
+from vawm.errors import InvalidInput
+from vawm.types import ArraySpec, PyTree
+
+IDLE = -1  # in place of an environment, between two orders
+WATCH_SECONDS = 1.0
+"""Between two looks at whether the pool's process lives, where the kernel does not tell."""
+TELL = signal.SIGUSR1  # asks a worker that hangs where it is
+PR_SET_PDEATHSIG = 1  # linux/prctl.h
+LARGEST = float(np.finfo(np.float32).max)
+LONGEST = 300  # characters of an exception's message
+
+
+class Description(NamedTuple):
+    """What a simulator says of itself; see `Simulator`."""
+
+    obs: PyTree
+    action_size: int
+    discrete: bool
+    episode_length: int | None
+
+
+class Trouble(NamedTuple):
+    """What went wrong with one environment.
+
+    Attributes:
+      reason: in a few words, without the environment.
+      traceback: of the worker, or "".
+      building: whether it failed to be made.
+      guilty: False where another environment took the worker down.
+      refused: field, value and remedy where it raised `InvalidInput` when it was made.
+    """
+
+    reason: str
+    traceback: str = ""
+    building: bool = False
+    guilty: bool = True
+    refused: tuple[str, Any, str] | None = None
+
+
+class Answer(NamedTuple):
+    """To the order `ticket`: environments that returned something, and those that failed."""
+
+    ticket: int
+    results: dict[int, Any]
+    troubles: dict[int, Trouble]
+
+
+class Unusable(ValueError):
+    """A simulator returned what no agent can use; the message says what."""
+
+
+class NotBuilt(Exception):
+    """Its cause was raised while a simulator was being made."""
+
+
+def control_fields(workers: int) -> Fields:
+    """What every worker is doing: the environment, and since when (`time.monotonic`)."""
+    return {"environment": ((workers,), np.int64), "began": ((workers,), np.float64)}
+
+
+def array_fields(workers: int, num_envs: int, obs: PyTree, action_size: int) -> Fields:
+    """All that is in memory of both; each environment has a row of its own."""
+    step = {
+        "action": ((num_envs, action_size), np.float32),
+        "reward": ((num_envs,), np.float32),
+        "is_last": ((num_envs,), np.bool_),
+        "is_terminal": ((num_envs,), np.bool_),
+    }
+    seen = {name: ((num_envs, *spec.shape), spec.dtype) for name, _, spec in leaves(obs)}
+    return {**control_fields(workers), **step, **seen}
+
+
+def leaves(obs: PyTree) -> list[tuple[str, Any, Any]]:
+    """(name, key, array) of each array in an observation, by key; that of a single is None."""
+    if isinstance(obs, dict):
+        return [(f"obs[{key!r}]", key, obs[key]) for key in sorted(obs)]
+    return [("obs", None, obs)]
+
+
+class Worker:
+    """Some environments, and how each order is carried out for one of them."""
+
+    def __init__(self, index: int, workers: int, num_envs: int, channel: Channel, file: int):
+        self.index, self.workers, self.num_envs = index, workers, num_envs
+        self.channel, self.file = channel, file
+        self.control = view(file, control_fields(workers))
+        self.simulators: dict[int, Simulator] = {}
+        self.description = Description((), 0, False, None)  # until one is built
+
+    def serve(self) -> None:
+        """Answers orders until the pool is gone."""
+        with contextlib.suppress(EOFError, OSError):
+            while True:
+                self.channel.send(self.answer(*self.channel.receive()))
+
+    def answer(self, ticket: int, name: str, payloads: Mapping[int, Any]) -> Answer:
+        results, troubles = {}, {}
+        carry_out = getattr(self, name)
+        for env, payload in payloads.items():
+            self.note(env)
+            try:
+                result = carry_out(env, payload)
+            except BaseException as error:
+                troubles[env] = describe(error)
+            else:
+                if result is not None:
+                    results[env] = result
+        self.note(IDLE)
+        return Answer(ticket, results, troubles)
+
+    def note(self, env: int) -> None:
+        """Says which environment is being called, should the call never return."""
+        self.control["environment"][self.index] = env
+        self.control["began"][self.index] = time.monotonic()
+
+    def build(self, env: int, factory: bytes) -> Description:
+        """Makes the simulator, in place of one that failed; each from its own copy."""
+        self.close(env)
+        try:
+            simulator = pickle.loads(factory)()
+            self.description = describe_simulator(simulator)
+        except BaseException as error:
+            raise NotBuilt from error
+        self.simulators[env] = simulator
+        return self.description
+
+    def begin(self, env: int, seed: int) -> None:
+        """Begins the episode of a seed."""
+        self.write(env, Outcome(self.simulators[env].reset(seed), 0.0, False, False))
+
+    def step(self, env: int, seed: int | None) -> None:
+        """One step with the action in memory; where there is a seed, begins its episode."""
+        if seed is None:
+            action = self.action(self.arrays["action"][env])
+            self.write(env, self.simulators[env].step(action))
+        else:
+            self.begin(env, seed)
+
+    def replay(self, env: int, episode: tuple[int, np.ndarray]) -> None:
+        """Plays an episode up to its last action: its seed and `[length, action_size]`."""
+        seed, actions = episode
+        self.begin(env, seed)
+        for count, action in enumerate(actions, start=1):
+            self.note(env)
+            outcome = self.simulators[env].step(self.action(action))
+            if count == len(actions):
+                self.write(env, outcome)
+            elif outcome.is_last:
+                raise Unusable(f"the episode ended after {count} of {len(actions)} steps")
+
+    def close(self, env: int, _: None = None) -> None:
+        """Lets go of the simulator, whatever it says."""
+        simulator = self.simulators.pop(env, None)
+        if simulator is not None:
+            with contextlib.suppress(BaseException):
+                simulator.close()
+
+    @functools.cached_property
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Memory of both; the pool has made room before the first episode begins."""
+        obs, action_size = self.description[:2]
+        return view(self.file, array_fields(self.workers, self.num_envs, obs, action_size))
+
+    @functools.cached_property
+    def obs(self) -> list[tuple[str, Any, ArraySpec, np.ndarray]]:
+        """(name, key, spec, memory `[N, ...]`) of each array in an observation."""
+        return [(*leaf, self.arrays[leaf[0]]) for leaf in leaves(self.description.obs)]
+
+    def action(self, raw: np.ndarray) -> np.ndarray | int:
+        """What a simulator gets for a raw action `[action_size]`; NaN counts as 0."""
+        action = np.where(np.isnan(raw), np.float32(0), raw)
+        if self.description.discrete:
+            return int(np.argmax(action))
+        return np.clip(action, -1, 1)
+
+    def write(self, env: int, outcome: Outcome) -> None:
+        """Passes an outcome on once all of it is known to be sound."""
+        reward = check_reward(outcome.reward)
+        for name in ("is_last", "is_terminal"):
+            flag = getattr(outcome, name)
+            if not isinstance(flag, (bool, np.bool_)):
+                raise Unusable(f"{name} is {flag!r:.100}, not True or False")
+        values = [self.entry(outcome.obs, key) for _, key, *_ in self.obs]
+        for (name, _, spec, _), value in zip(self.obs, values, strict=True):
+            check_array(name, value, spec)
+        for (*_, memory), value in zip(self.obs, values, strict=True):
+            memory[env] = value
+        self.arrays["reward"][env] = reward
+        self.arrays["is_last"][env] = outcome.is_last
+        self.arrays["is_terminal"][env] = outcome.is_terminal
+
+    def entry(self, obs: PyTree, key: Any) -> Any:
+        """`obs`, or its entry `key` where an observation is a dict."""
+        if key is None:
+            return obs
+        if not isinstance(obs, Mapping) or len(obs) != len(self.obs) or key not in obs:
+            kind = f"of {sorted(map(str, obs))}" if isinstance(obs, Mapping) else type(obs)
+            raise Unusable(f"obs is {kind}, not a dict of {[key for _, key, *_ in self.obs]}")
+        return obs[key]
+
+
+def describe_simulator(simulator: Simulator) -> Description:
+    """What it says of itself.
+
+    Raises:
+      TypeError: names what is not as `Simulator` says.
+    """
+    said = Description(*(getattr(simulator, name) for name in Description._fields))
+    for name, key, spec in leaves(said.obs):
+        if not isinstance(spec, ArraySpec) or not isinstance(key, (str, type(None))):
+            raise TypeError(f"{name} of the simulator is {spec!r:.100}, not an ArraySpec")
+    for name, value in (("action_size", said.action_size), ("episode_length", said[-1])):
+        may_be_none = name == "episode_length" and value is None
+        if not may_be_none and not (isinstance(value, (int, np.integer)) and value >= 1):
+            raise TypeError(f"{name} of the simulator is {value!r:.100}, not 1 or more")
+    return Description(
+        obs=said.obs,
+        action_size=int(said.action_size),
+        discrete=bool(said.discrete),
+        episode_length=None if said.episode_length is None else int(said.episode_length),
+    )
+
+
+def check_reward(reward: Any) -> float:
+    """A number that float32 can hold.
+
+    Raises:
+      Unusable: says what it is instead.
+    """
+    if isinstance(reward, np.ndarray) and reward.ndim == 0:
+        reward = reward[()]
+    if not isinstance(reward, (int, float, np.floating, np.integer, np.bool_)):
+        raise Unusable(f"reward is {reward!r:.100}, not a number")
+    if not abs(number := float(reward)) <= LARGEST:
+        raise Unusable(f"reward is {number}")
+    return number
+
+
+def check_array(name: str, value: Any, spec: ArraySpec) -> None:
+    """An array as its spec says, and finite.
+
+    Raises:
+      Unusable: says what it is instead.
+    """
+    if not isinstance(value, np.ndarray):
+        raise Unusable(f"{name} is a {type(value).__name__}, not a numpy array")
+    if value.dtype != spec.dtype or value.shape != spec.shape:
+        raise Unusable(
+            f"{name} is {value.dtype}{list(value.shape)}, not {spec.dtype}{list(spec.shape)}"
+        )
+    if value.dtype.kind == "f" and not (finite := np.isfinite(value)).all():
+        where = np.argwhere(~finite)[0].tolist()
+        raise Unusable(f"{name}{where or ''} is {value[tuple(where)]}")
+
+
+def describe(error: BaseException) -> Trouble:
+    """An exception, in a form that can be sent."""
+    building = isinstance(error, NotBuilt)
+    cause = (error.__cause__ if building else None) or error
+    reason = str(cause) if isinstance(cause, Unusable) else f"raised {one_line(cause)}"
+    refused = None
+    if building and isinstance(cause, InvalidInput):
+        refused = cause.field, sendable(cause.value), cause.remedy
+    return Trouble(
+        reason=f"could not be made: {reason}" if building else reason,
+        traceback="".join(traceback.format_exception(cause)),
+        building=building,
+        refused=refused,
+    )
+
+
+def one_line(error: BaseException) -> str:
+    """Name and message of an exception."""
+    message = " ".join("".join(traceback.format_exception_only(error)).split())
+    return message if len(message) <= LONGEST else f"{message[:LONGEST]}..."
+
+
+def sendable(value: Any) -> Any:
+    """`value`, or what it looks like where the pool's process may not know its type."""
+    try:
+        json.dumps(value)
+    except Exception:
+        return repr(value)
+    return value
+
+
+def main() -> None:
+    """Serves the pool that started this process; its settings are the last argument."""
+    settings = json.loads(sys.argv[-1])
+    for name in ("channel", "memory", "crash"):
+        os.set_inheritable(settings[name], False)  # not for programs a simulator starts
+    for number in (signal.SIGINT, signal.SIGTERM):
+        # Not SIG_IGN, which the programs that a simulator starts would inherit.
+        signal.signal(number, lambda *_: None)
+    # It is in the background of a terminal, which may stop those that print.
+    signal.signal(signal.SIGTTOU, signal.SIG_IGN)
+    end_with(settings["parent"], by_kernel=settings["by_kernel"])
+    faulthandler.enable(settings["crash"], all_threads=False)
+    faulthandler.register(TELL, settings["crash"], all_threads=False)
+    channel = Channel(socket.socket(fileno=settings["channel"]))
+    place = settings["index"], settings["workers"], settings["num_envs"]
+    Worker(*place, channel, settings["memory"]).serve()
+    os._exit(0)  # threads that a simulator left behind must not keep the process
+
+
+def end_with(parent: int, *, by_kernel: bool) -> None:
+    """Ends this process when its parent has ended, even within a call that never returns.
+
+    Args:
+      parent: its process id.
+      by_kernel: has Linux do it, also where the call holds on to the interpreter. Linux does
+        so when the *thread* that started the process ends, which must be the last one then.
+    """
+    if by_kernel and sys.platform == "linux":
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(WATCH_SECONDS)
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    if os.getppid() != parent:  # it ended before the kernel was asked
+        os._exit(1)
+    threading.Thread(target=watch, daemon=True).start()
