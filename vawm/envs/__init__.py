@@ -4,17 +4,22 @@
     state, timestep = jax.jit(env.reset)(jax.random.key(0))
     state, timestep = jax.jit(env.step)(state, action)
 
-Importing this module is cheap: MuJoCo is loaded by `make`.
+`from_gymnasium` runs any Gymnasium environment, in processes of its own. Importing this
+module is cheap: MuJoCo is loaded by `make`, and what runs processes when it is asked for.
 """
 
 from __future__ import annotations
 
 import difflib
+from typing import TYPE_CHECKING, Any
 
 from vawm.envs.protocol import Environment, EnvState, check_positive
 from vawm.errors import InvalidInput
 
-__all__ = ["EPISODE_STEPS", "TASKS", "EnvState", "Environment", "make"]
+if TYPE_CHECKING:
+    from vawm.envs.host.gymnasium import from_gymnasium
+
+__all__ = ["EPISODE_STEPS", "TASKS", "EnvState", "Environment", "from_gymnasium", "make"]
 
 EPISODE_STEPS = 1000  # control steps in an episode of every task
 
@@ -30,6 +35,15 @@ DOMAINS = {
     "walker": ("run", "stand", "walk"),
 }
 TASKS = tuple(f"{domain}_{task}" for domain, tasks in DOMAINS.items() for task in tasks)
+
+
+def __getattr__(name: str) -> Any:
+    """`from_gymnasium`, imported when it is first asked for."""
+    if name == "from_gymnasium":
+        from vawm.envs.host.gymnasium import from_gymnasium
+
+        return from_gymnasium
+    raise AttributeError(f"module 'vawm.envs' has no attribute {name!r}")
 
 
 def make(task: str, *, num_envs: int, action_repeat: int = 1) -> Environment:

@@ -1,0 +1,407 @@
+"""Gymnasium environments as simulators, and what is found wrong with them."""
+
+import time
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.wrappers import TimeLimit
+
+from vawm import envs
+from vawm.envs.host.gymnasium import (
+    GymnasiumSimulator,
+    check_id,
+    from_gymnasium,
+    name_of,
+    problems,
+)
+from vawm.envs.host.pool import EnvironmentFailure, episode_seed
+from vawm.errors import InvalidInput
+from vawm.types import image, vector
+
+
+class Example(gymnasium.Env):
+    """An environment that shows what its spaces say, for episodes of 10 steps.
+
+    Attributes that tests replace: `obs`, `reward`, `terminated`.
+    """
+
+    observation_space = spaces.Box(-1, 1, (3,))
+    action_space = spaces.Box(-1, 1, (2,))
+    reward = 1.0
+    terminated = None  # at the end
+
+    def __init__(self, **changes):
+        for name, value in changes.items():
+            setattr(self, name, value)
+        self.seen = []
+
+    def show(self):
+        if hasattr(self, "obs"):
+            return self.obs
+        space = self.observation_space
+        if isinstance(space, spaces.Dict):
+            return {key: np.zeros(box.shape, box.dtype) for key, box in space.items()}
+        return np.zeros(space.shape, space.dtype)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return self.show(), {}
+
+    def step(self, action):
+        self.steps += 1
+        self.seen.append(action)
+        over = self.steps == 10 if self.terminated is None else self.terminated
+        return self.show(), self.reward, over, False, {}
+
+
+# As a simulator.
+
+
+@pytest.mark.parametrize(
+    ("box", "spec"),
+    [
+        (spaces.Box(-1, 1, (3,)), vector(3)),
+        (spaces.Box(-1, 1, (2, 3), np.float64), vector(6)),
+        (spaces.Box(-5, 5, (), np.int64), vector(1)),
+        (spaces.Box(0, 1, (4,), np.bool_), vector(4)),
+        (spaces.Box(0, 255, (128,), np.uint8), vector(128)),
+        (spaces.Box(0, 255, (4, 7), np.uint8), vector(28)),
+        (spaces.Box(0, 255, (15, 15), np.uint8), vector(225)),
+        (spaces.Box(0, 255, (16, 16), np.uint8), image(16, channels=1)),
+        (spaces.Box(0, 255, (64, 64, 3), np.uint8), image(64)),
+        (spaces.Box(0, 255, (7, 7, 3), np.uint8), image(7)),
+    ],
+)
+def test_an_observation_is_an_image_or_a_vector(box, spec):
+    simulator = GymnasiumSimulator(Example(observation_space=box))
+    assert simulator.obs == spec
+    simulator.reset(0)
+    for obs in (simulator.reset(0), simulator.step(np.zeros(2, np.float32)).obs):
+        assert (obs.shape, obs.dtype) == (spec.shape, spec.dtype)
+
+
+def test_the_numbers_of_an_observation_keep_their_order():
+    picture = np.arange(256, dtype=np.uint8).reshape(16, 16)
+    table = np.arange(6.0).reshape(2, 3)
+    space = spaces.Dict(
+        picture=spaces.Box(0, 255, (16, 16), np.uint8),
+        table=spaces.Box(0, 9, (2, 3), np.float64),
+    )
+    env = Example(observation_space=space, obs={"picture": picture, "table": table})
+    simulator = GymnasiumSimulator(env)
+    assert simulator.obs == {"picture": image(16, channels=1), "table": vector(6)}
+    obs = simulator.reset(0)
+    np.testing.assert_array_equal(obs["picture"][..., 0], picture)
+    np.testing.assert_array_equal(obs["table"], np.arange(6))
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_actions_are_stretched_to_their_bounds(dtype):
+    low, high = np.array([[-2, 0.1, -3e38]], dtype), np.array([[6, 0.3, 3e38]], dtype)
+    env = Example(action_space=spaces.Box(low, high, dtype=dtype))
+    simulator = GymnasiumSimulator(env)
+    assert (simulator.action_size, simulator.discrete) == (3, False)
+    simulator.reset(0)
+    for action in (-1, 0, 1, 0.5):
+        simulator.step(np.full(3, action, np.float32))
+    assert all(action in env.action_space for action in env.seen)
+    np.testing.assert_allclose(env.seen[0], low, rtol=1e-6)
+    np.testing.assert_allclose(env.seen[1], [[2, 0.2, 0]], rtol=1e-6)
+    np.testing.assert_allclose(env.seen[2], high, rtol=1e-6)
+    np.testing.assert_allclose(env.seen[3], [[4, 0.25, 1.5e38]], rtol=1e-6)
+
+
+def test_choices_begin_where_their_space_does():
+    env = Example(action_space=spaces.Discrete(3, start=-1))
+    simulator = GymnasiumSimulator(env)
+    assert (simulator.action_size, simulator.discrete) == (3, True)
+    simulator.reset(0)
+    for index in range(3):
+        simulator.step(index)
+    assert env.seen == [-1, 0, 1]
+    assert all(action in env.action_space for action in env.seen)
+
+
+@pytest.mark.parametrize("reward", [2, 2.0, np.float64(2), np.int32(2), np.array(2.0)])
+def test_rewards_and_ends_are_passed_on(reward):
+    simulator = GymnasiumSimulator(TimeLimit(Example(reward=reward), 12))
+    simulator.reset(0)
+    outcomes = [simulator.step(np.zeros(2, np.float32)) for _ in range(12)]
+    assert all(outcome.reward == 2 for outcome in outcomes)
+    assert [(o.is_last, o.is_terminal) for o in outcomes[8:]] == [
+        (False, False),
+        (True, True),
+        (False, False),
+        (True, False),
+    ]
+    assert simulator.episode_length is None
+
+
+def test_an_observation_of_another_shape_is_not_flattened():
+    simulator = GymnasiumSimulator(Example(obs=np.zeros((3, 1), np.float32)))
+    with pytest.raises(ValueError, match=r"shape \(3, 1\), its space \(3,\)"):
+        simulator.reset(0)
+
+
+# Problems.
+
+
+def test_a_sound_environment_has_no_problems():
+    assert problems(Example()) == []
+    assert problems(Example(reward=np.float32(1), terminated=np.bool_(True))) == []
+    assert problems(TimeLimit(Example(terminated=False), 20)) == []
+    for name in ("CartPole-v1", "Pendulum-v1", "Acrobot-v1", "MountainCarContinuous-v0"):
+        assert problems(gymnasium.make(name, disable_env_checker=True)) == [], name
+
+
+def test_all_problems_come_at_once():
+    class Wrong(Example):
+        observation_space = spaces.Dict(
+            big=spaces.Box(0, 255, (64, 64, 3), np.uint8),
+            small=spaces.Box(0, 255, (32, 32, 3), np.uint8),
+            first=spaces.Box(0, 255, (3, 64, 64), np.uint8),
+            wide=spaces.Box(0, 255, (64, 96, 3), np.uint8),
+            stack=spaces.Box(0, 255, (4, 84, 84, 3), np.uint8),
+            choice=spaces.Discrete(4),
+            nothing=spaces.Box(0, 1, (0,)),
+            double=spaces.Box(-1, 1, (2,)),
+            shape=spaces.Box(-1, 1, (2,)),
+            nan=spaces.Box(-1, 1, (2,)),
+            far=spaces.Box(-1, 1, (2,)),
+            list=spaces.Box(-1, 1, (2,)),
+            missing=spaces.Box(-1, 1, (2,)),
+        )
+        action_space = spaces.Box(-np.inf, np.inf, (2,))
+
+        def reset(self, *, options=None):
+            return self.show()
+
+        def show(self):
+            return {
+                **{key: x for key, x in super().show().items() if key != "missing"},
+                "double": np.zeros(2),
+                "shape": np.zeros((2, 1), np.float32),
+                "nan": np.float32([0, np.nan]),
+                "far": np.float32([0, 3]),
+                "list": [0.0, 0.0],
+            }
+
+        def step(self, action):
+            return self.show(), np.ones(1), 0, {}
+
+    found = problems(Wrong())
+    expected = [
+        "observation_space['choice'] is Discrete(4), not a Box: use",
+        "observation_space['first'] has images of shape (3, 64, 64), channels first: move",
+        "observation_space['nothing'] has shape (0,), no numbers at all: leave",
+        "observation_space['stack'] has bytes of shape (4, 84, 84, 3): stack",
+        "observation_space['wide'] has images of shape (64, 96, 3), not square: use",
+        "images have sides of {'big': 64, 'small': 32} pixels: give all the same",
+        "action space Box(-inf, inf, (2,), float32) has no bounds: declare",
+        "reset() does not accept seed=: take seed=None",
+        "reset() returns one value, a dict: return obs, info",
+        "obs has keys ",
+        "obs['double'] is float64, its space float32: return .astype(np.float32)",
+        "obs['far'][1] is 3, out of its space's bounds: declare wider",
+        "obs['list'] is a list: return a numpy array of float32",
+        "obs['nan'][1] is nan: return finite",
+        "obs['shape'] has shape (2, 1), its space (2,): return",
+        "step() returns 4 values, one flag for two kinds of end: return obs, reward, term",
+        "reward has shape (1,): return a number",
+        "terminated is 0: return True or False",
+        "no episode ended within 1000 random steps, and none has to: pass time_limit=",
+    ]
+    assert len(found) == len(expected), found
+    for text in expected:
+        assert any(one.startswith(text) for one in found), text
+
+
+def raises(error):
+    def method(*args, **kwargs):
+        raise error
+
+    return method
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"observation_space": spaces.Discrete(4)}, "observation space is Discrete(4), not"),
+        ({"observation_space": spaces.Tuple([]), "obs": ()}, "observation space is Tuple()"),
+        ({"observation_space": spaces.Dict()}, "observation space is an empty Dict"),
+        ({"observation_space": None, "obs": 0}, "observation space is None, not a Box"),
+        ({"action_space": spaces.MultiDiscrete([2, 3])}, "action space is MultiDiscrete"),
+        ({"action_space": spaces.Box(0, 5, (2,), np.int32)}, "action space is a Box of int32"),
+        ({"action_space": spaces.Box(0, 1, (0,))}, "action space has shape (0,)"),
+        ({"obs": {"state": np.zeros(3)}}, "obs is a dict: return a numpy array"),
+        ({"obs": np.full(3, np.inf, np.float32)}, "obs[0] is inf: return finite"),
+        ({"reward": None}, "reward is None: return a number"),
+        ({"reward": float("nan")}, "reward is nan: return a finite number"),
+        ({"terminated": None, "reset": raises(OSError("no"))}, "reset() raised OSError: no"),
+        ({"step": raises(KeyError("x"))}, "step() raised KeyError: 'x'"),
+        ({"step": raises(SystemExit("x"))}, "step() raised SystemExit: x"),
+        ({"step": lambda action: (0, 0)}, "step() returns 2 values: return obs, reward"),
+        ({"step": lambda action: None}, "step() returns one value, a NoneType"),
+        ({"terminated": False}, "no episode ended within 100 random steps"),
+    ],
+)
+def test_a_problem_is_named_with_a_remedy(changes, text):
+    (found,) = problems(Example(**changes), steps=100)
+    assert found.startswith(text)
+    assert ": " in found
+
+
+def test_bounds_that_are_reversed_are_a_problem():
+    box = spaces.Box(-1, 1, (2,))
+    box.low, box.high = box.high, box.low
+    (found,) = problems(Example(action_space=box))
+    assert found.startswith("action space has bounds that are reversed")
+
+
+def test_an_environment_of_the_old_api_is_understood_behind_wrappers():
+    def step(action):
+        return np.zeros(3, np.float32), 1.0, False, {}
+
+    def reset(seed=None, options=None):
+        return np.zeros(3, np.float32)
+
+    env = TimeLimit(Example(step=step, reset=reset), 50)
+    assert [text.split(":")[0] for text in problems(env)] == [
+        "reset() returns one value, a ndarray",
+        "step() returns 4 values, one flag for two kinds of end",
+    ]
+
+
+def test_what_is_no_gymnasium_environment_is_one_problem():
+    (found,) = problems(object())
+    assert found == "it is a builtins.object: derive it from gymnasium.Env"
+    found = problems(type("Bare", (gymnasium.Env,), {})())
+    assert [text.split(":")[0] for text in found] == [
+        "observation_space raised AttributeError",
+        "action_space raised AttributeError",
+        "reset() returns one value, a NoneType",
+        "a trial raised AttributeError",
+    ]
+
+
+def test_a_slow_environment_is_played_for_some_seconds_only():
+    def step(action):
+        time.sleep(0.1)
+        return np.zeros(3, np.float32), 1.0, False, False, {}
+
+    began = time.monotonic()
+    assert problems(Example(step=step), seconds=0.3) == []  # nor is it said to be endless
+    assert time.monotonic() - began < 2
+
+
+# In a pool.
+
+
+def play_alone(env, seed, actions):
+    """(obs, reward, is_first, is_last, is_terminal) per action, of environment 0 of a pool."""
+    episode, over = 0, True
+    for action in actions:
+        if over:
+            obs, _ = env.reset(seed=episode_seed(seed, 0, episode))
+            episode, over = episode + 1, False
+            yield obs, 0, True, False, False
+        else:
+            obs, reward, terminated, truncated, _ = env.step(action)
+            over = terminated or truncated
+            yield obs, reward, False, over, terminated
+
+
+@pytest.mark.parametrize("name", ["CartPole-v1", "Pendulum-v1"])
+def test_a_pool_plays_what_the_environment_does(name):
+    discrete = name == "CartPole-v1"
+    rng = np.random.default_rng(0)
+    size = 2 if discrete else 1
+    actions = rng.uniform(-1, 1, size=(60, 1, size)).astype(np.float32)
+    alone = gymnasium.make(name, max_episode_steps=15)
+    native = actions[:, 0].argmax(-1) if discrete else 2 * actions[:, 0]
+    expected = play_alone(alone, 5, [None, *native])
+    with envs.from_gymnasium(name, time_limit=15) as pool:
+        assert pool.spec.task == name
+        assert (pool.spec.discrete, pool.spec.action_size) == (discrete, size)
+        assert pool.spec.episode_length is None
+        timesteps = [pool.reset(5)]
+        for action in actions:
+            pool.send(action)
+            timesteps.append(pool.receive())
+    assert sum(t.is_first[0] for t in timesteps) > 3
+    for timestep, (obs, reward, *flags) in zip(timesteps, expected, strict=True):
+        np.testing.assert_array_equal(timestep.obs[0], obs)
+        assert timestep.reward[0] == np.float32(reward)
+        assert [x[0] for x in timestep[2:]] == flags
+
+
+def test_what_is_wrong_reaches_the_caller_as_one_refusal():
+    with pytest.raises(InvalidInput) as caught:
+        from_gymnasium(Example, terminated=False, reward=None)
+    error = caught.value
+    assert (error.field, error.value) == ("env", "Example")
+    assert error.remedy.startswith("2 problems: (1) reward is None: return a number; (2) no ep")
+
+
+def test_without_a_check_the_first_failure_ends_the_pool():
+    with from_gymnasium(Example, check=False, reward=None, task="mine") as pool:
+        assert pool.spec.task == "mine"
+        pool.reset(0)
+        pool.send(np.zeros((1, 2)))
+        with pytest.raises(EnvironmentFailure, match="step 1: reward is None, not a number"):
+            pool.receive()
+
+
+def test_an_id_that_only_this_process_registered_is_made_in_workers():
+    gymnasium.register(
+        "vawm-test/Here-v0", entry_point=lambda size: Example(), kwargs={"size": 1}
+    )
+    try:
+        with from_gymnasium("vawm-test/Here-v0", num_envs=2, workers=1, size=1) as pool:
+            assert pool.spec.obs == vector(3)
+            assert pool.reset(0).is_first.all()
+    finally:
+        del gymnasium.registry["vawm-test/Here-v0"]
+
+
+def test_an_environment_that_cannot_be_made_is_refused():
+    entry_point = "a_package_that_is_missing:Env"
+    gymnasium.register("vawm-test/Missing-v0", entry_point=entry_point)
+    try:
+        with pytest.raises(InvalidInput, match=r"cannot be made: ModuleNotFoundError"):
+            from_gymnasium("vawm-test/Missing-v0")
+    finally:
+        del gymnasium.registry["vawm-test/Missing-v0"]
+
+
+@pytest.mark.parametrize(
+    ("name", "match"),
+    [
+        ("CartPole-v7", "env='CartPole-v7': did you mean 'CartPole-v1'"),
+        ("CartPole", "did you mean 'CartPole-v1'"),
+        ("xyz", "env='xyz': use a registered id"),
+        ("not_there:Env-v0", "module 'not_there' cannot be imported"),
+    ],
+)
+def test_an_unknown_id_is_refused_with_the_nearest(name, match):
+    with pytest.raises(InvalidInput, match=match):
+        from_gymnasium(name)
+
+
+def test_an_impossible_time_limit_is_refused():
+    with pytest.raises(InvalidInput, match="time_limit=0"):
+        from_gymnasium("CartPole-v1", time_limit=0)
+
+
+def test_a_module_in_an_id_is_imported():
+    assert check_id("gymnasium:CartPole-v1").id == "CartPole-v1"
+
+
+def test_a_task_is_named_after_what_makes_it():
+    assert name_of("ALE/Pong-v5") == "ALE/Pong-v5"
+    assert name_of("module:Name-v0") == "Name-v0"
+    assert name_of(Example) == "Example"
+    assert name_of(lambda: None) == "environment"

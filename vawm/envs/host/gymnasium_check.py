@@ -1,0 +1,318 @@
+"""What has to hold of a Gymnasium environment: everything that does not, at once.
+
+Each problem is one clause and its remedy. What is returned is looked at while seeded random
+actions are played, in an environment that is made for that.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.wrappers import TimeLimit
+
+from vawm.envs.host.worker import one_line
+from vawm.errors import InvalidInput
+
+SMALLEST_IMAGE = 16
+"""Pixels a side from which bytes in two dimensions are a picture and not a table."""
+TOLERANCE = 1e-4
+"""By which observations may leave their bounds, relative to them or to 1: rounding."""
+
+Add = Callable[[str, str], Any]
+"""Takes a kind of problem and its text; the first of a kind counts."""
+
+
+def problems(env: gymnasium.Env, *, steps: int = 1000, seconds: float = 5.0) -> list[str]:
+    """Everything that keeps an environment from being learned from, each with a remedy.
+
+    Plays random actions, always the same ones. Never raises; does not close `env`.
+
+    Args:
+      env: used up: its state afterwards is of no use.
+      steps: actions to play.
+      seconds: after which no further action is played.
+    """
+    if not isinstance(env, gymnasium.Env):
+        kind = f"{type(env).__module__}.{type(env).__qualname__}"
+        return [f"it is a {kind}: derive it from gymnasium.Env"]
+    return look_at(
+        env,
+        {
+            "observation_space": look_at_observation_space,
+            "action_space": look_at_action_space,
+            "a trial": functools.partial(try_out, steps=steps, seconds=seconds),
+        },
+    )
+
+
+def space_problems(env: gymnasium.Env) -> list[str]:
+    """Those of `problems` that show without playing."""
+    return look_at(
+        env,
+        {
+            "observation_space": look_at_observation_space,
+            "action_space": look_at_action_space,
+        },
+    )
+
+
+def look_at(env: gymnasium.Env, looks: Mapping[str, Callable[..., None]]) -> list[str]:
+    """What some looks find; one that fails is a problem itself."""
+    found: dict[str, str] = {}
+    for name, look in looks.items():
+        try:
+            look(env, found.setdefault)
+        except (Exception, SystemExit) as error:
+            found[name] = f"{name} raised {one_line(error)}: make it work by itself"
+    return list(found.values())
+
+
+def look_at_observation_space(env: gymnasium.Env, add: Add) -> None:
+    """A `Box` or a `Dict` of them, pictures square and of one size."""
+    space: Any = env.observation_space
+    if not isinstance(space, spaces.Dict):
+        if text := box_problem(space):
+            add("observation_space", f"observation space {text}")
+        return
+    if not space.spaces:
+        add("observation_space", "observation space is an empty Dict: add a Box")
+    boxes: dict[Any, Any] = dict(space.items())
+    for key, entry in boxes.items():
+        name = f"observation_space[{key!r}]"
+        if not isinstance(key, str):
+            add(name, f"{name} has a key that is no string: use a string")
+        if text := box_problem(entry):
+            add(name, f"{name} {text}")
+    sides = {
+        key: box.shape[0] for key, box in boxes.items() if not box_problem(box) and pixels(box)
+    }
+    if len(set(sides.values())) > 1:
+        remedy = "give all the same with gymnasium.wrappers.ResizeObservation"
+        add("image sizes", f"images have sides of {sides} pixels: {remedy}")
+
+
+def box_problem(space: Any) -> str:
+    """What is wrong with a space of observations, and a remedy; "" if nothing is."""
+    if not isinstance(space, spaces.Box):
+        remedy = "return a Box from an ObservationWrapper"
+        if isinstance(space, spaces.Space) and space.is_np_flattenable:
+            remedy = "use gymnasium.wrappers.FlattenObservation, or return a Box"
+        return f"is {space!s:.100}, not a Box: {remedy}"
+    shape = space.shape
+    if 0 in shape:
+        return f"has shape {shape}, no numbers at all: leave it out"
+    if space.dtype != np.uint8 or len(shape) < 2:
+        return ""
+    if len(shape) > 3:
+        return f"has bytes of shape {shape}: stack frames along the channels, (H, W, C)"
+    table = len(shape) == 2 and min(shape) < SMALLEST_IMAGE
+    if table or shape[0] == shape[1]:
+        return ""
+    if len(shape) == 3 and shape[1] == shape[2]:
+        remedy = "move them last with gymnasium.wrappers.TransformObservation"
+        return f"has images of shape {shape}, channels first: {remedy}"
+    remedy = "use gymnasium.wrappers.ResizeObservation"
+    return f"has images of shape {shape}, not square: {remedy}"
+
+
+def pixels(box: Any) -> bool:
+    """Whether a `Box` without problems is of pictures."""
+    if box.dtype != np.uint8 or len(box.shape) < 2:
+        return False
+    return len(box.shape) == 3 or min(box.shape) >= SMALLEST_IMAGE
+
+
+def look_at_action_space(env: gymnasium.Env, add: Add) -> None:
+    """A `Discrete`, or a `Box` of floats between bounds."""
+    space: Any = env.action_space
+    if isinstance(space, spaces.Discrete):
+        return
+    if not isinstance(space, spaces.Box):
+        remedy = "make it one Discrete or one Box with gymnasium.wrappers.TransformAction"
+        add("action_space", f"action space is {space!s:.100}: {remedy}")
+        return
+    if 0 in space.shape:
+        add("action_space", f"action space has shape {space.shape}: there is nothing to choose")
+    if space.dtype.kind != "f":
+        remedy = "use a Discrete, or floats that the environment rounds"
+        add("action_space", f"action space is a Box of {space.dtype}: {remedy}")
+    elif not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
+        remedy = "declare the finite low and high that actions need"
+        add("action_space", f"action space {space!s:.100} has no bounds: {remedy}")
+    elif (space.low > space.high).any():
+        add("action_space", "action space has bounds that are reversed: swap low and high")
+
+
+def try_out(env: gymnasium.Env, add: Add, *, steps: int, seconds: float) -> None:
+    """Plays seeded random actions and looks at all that is returned."""
+    limited = has_time_limit(env)
+    with contextlib.suppress(Exception):  # sampling shows what is wrong
+        env.action_space.seed(0)
+    end = time.monotonic() + seconds
+    playing, episode, over, ended = env, 0, True, False
+    for _ in range(steps):
+        if time.monotonic() > end:
+            return  # too slow to tell whether an episode ends
+        if over:
+            begun = begin(playing, episode, add)
+            if begun is None:
+                return
+            playing, episode = begun, episode + 1
+        try:
+            action = env.action_space.sample()
+        except (Exception, SystemExit) as error:
+            # Of the same kind as, and hidden by, what was seen of the space before.
+            text = f"action_space.sample() raised {one_line(error)}: mend the space"
+            add("action_space", text)
+            return
+        try:
+            result = playing.step(action)
+        except (Exception, SystemExit) as error:
+            if "values to unpack" in str(error) and playing is not playing.unwrapped:
+                playing, over = playing.unwrapped, True  # wrappers expect five values
+                continue
+            add("step", f"step() raised {one_line(error)}: play random actions to see where")
+            return
+        over = look_at_step(result, playing.observation_space, add)
+        ended |= over
+    if not ended and not limited:
+        remedy = "pass time_limit="
+        add("end", f"no episode ended within {steps} random steps, and none has to: {remedy}")
+
+
+def look_at_step(result: Any, space: Any, add: Add) -> bool:
+    """Looks at what `step` returned; whether the episode is over."""
+    five = "return obs, reward, terminated, truncated, info"
+    if isinstance(result, tuple) and len(result) == 4:  # the API of gym before 0.26
+        add("step values", f"step() returns 4 values, one flag for two kinds of end: {five}")
+        result = (*result[:3], False, result[3])
+    if not isinstance(result, tuple) or len(result) != 5:
+        add("step values", f"step() returns {number_of(result)}: {five}")
+        return True
+    obs, reward, terminated, truncated, _ = result
+    look_at_observation(obs, space, add)
+    look_at_reward(reward, add)
+    for name, flag in (("terminated", terminated), ("truncated", truncated)):
+        if not isinstance(flag, (bool, np.bool_)):
+            add(name, f"{name} is {flag!r:.50}: return True or False")
+    return bool(np.any(terminated) or np.any(truncated))
+
+
+def has_time_limit(env: gymnasium.Env) -> bool:
+    """Whether it is known that every episode ends."""
+    layer = env
+    while isinstance(layer, gymnasium.Wrapper):
+        if isinstance(layer, TimeLimit):
+            return True
+        layer = layer.env
+    return getattr(env.spec, "max_episode_steps", None) is not None
+
+
+def begin(env: gymnasium.Env, seed: int, add: Add) -> gymnasium.Env | None:
+    """Resets and looks at what is returned; `env`, its innermost, or None if that fails."""
+    try:
+        try:
+            result: Any = env.reset(seed=seed)
+        except TypeError as error:
+            if "seed" not in str(error):
+                raise
+            remedy = "take seed=None, options=None and call super().reset(seed=seed)"
+            add("seed", f"reset() does not accept seed=: {remedy}")
+            env = env.unwrapped  # wrappers pass the seed on
+            result = env.reset()
+    except (Exception, SystemExit) as error:
+        add("reset", f"reset() raised {one_line(error)}: make it work by itself")
+        return None
+    if isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], dict):
+        result = result[0]
+    else:
+        add("reset values", f"reset() returns {number_of(result)}: return obs, info (a dict)")
+        result = result[0] if isinstance(result, tuple) and result else result
+    look_at_observation(result, env.observation_space, add)
+    return env
+
+
+def number_of(result: Any) -> str:
+    """How many values were returned."""
+    if isinstance(result, tuple):
+        return f"{len(result)} values"
+    return f"one value, a {type(result).__name__}"
+
+
+def look_at_observation(obs: Any, space: Any, add: Add) -> None:
+    """As the space says, finite and within bounds."""
+    if not isinstance(space, spaces.Dict):
+        look_at_array("obs", obs, space, add)
+        return
+    if not isinstance(obs, Mapping):
+        add("obs", f"obs is a {type(obs).__name__}, its space a Dict: return a dict")
+        return
+    if set(obs) != set(space.spaces):
+        keys = f"obs has keys {sorted(map(str, obs))}, its space {sorted(space.spaces)}"
+        add("obs keys", f"{keys}: return the keys of the space")
+    for key in space.spaces.keys() & obs.keys():
+        look_at_array(f"obs[{key!r}]", obs[key], space[key], add)
+
+
+def look_at_array(name: str, obs: Any, box: Any, add: Add) -> None:
+    """As the `Box` says, finite and within bounds; other spaces are a problem themselves."""
+    if not isinstance(box, spaces.Box):
+        return
+    if not isinstance(obs, (np.ndarray, np.generic)):
+        remedy = f"return a numpy array of {box.dtype}"
+        add(f"{name} type", f"{name} is a {type(obs).__name__}: {remedy}")
+        return
+    if obs.dtype != box.dtype:
+        remedy = f"return .astype(np.{box.dtype}), or declare a Box of {obs.dtype}"
+        add(f"{name} dtype", f"{name} is {obs.dtype}, its space {box.dtype}: {remedy}")
+    if obs.shape != box.shape:
+        remedy = "return what the space says, or declare the other"
+        add(f"{name} shape", f"{name} has shape {obs.shape}, its space {box.shape}: {remedy}")
+        return
+    if obs.dtype.kind not in "fiub":
+        return
+    value = np.asarray(obs, np.float64)
+    if not np.isfinite(value).all():
+        where, worst = first(~np.isfinite(value), value)
+        add(f"{name} finite", f"{name}{where} is {worst}: return finite numbers")
+        return
+    low, high = (np.asarray(bound, np.float64) for bound in (box.low, box.high))
+    low = low - TOLERANCE * np.maximum(1, np.abs(low))
+    high = high + TOLERANCE * np.maximum(1, np.abs(high))
+    if (outside := (value < low) | (value > high)).any():
+        where, worst = first(outside, value)
+        remedy = "declare wider bounds"
+        add(
+            f"{name} bounds", f"{name}{where} is {worst:g}, out of its space's bounds: {remedy}"
+        )
+
+
+def first(mask: np.ndarray, value: np.ndarray) -> tuple[str, float]:
+    """Index, in brackets, and value of the first entry that is True in a mask."""
+    where = np.argwhere(mask)[0].tolist()
+    return f"{where or ''}", float(value[tuple(where)])
+
+
+def look_at_reward(reward: Any, add: Add) -> None:
+    """A finite number."""
+    if np.ndim(reward):
+        add("reward", f"reward has shape {np.shape(reward)}: return a number")
+    elif not isinstance(np.asarray(reward)[()], (np.bool_, np.integer, np.floating)):
+        add("reward", f"reward is {reward!r:.50}: return a number")
+    elif not np.isfinite(reward):
+        add("reward", f"reward is {reward}: return a finite number")
+
+
+def refuse(name: str, found: list[str]) -> None:
+    """Raises `InvalidInput` for an environment with problems."""
+    if found:
+        count = f"{len(found)} problem{'s' if len(found) > 1 else ''}"
+        listed = "; ".join(f"({i}) {text}" for i, text in enumerate(found, start=1))
+        raise InvalidInput("env", name, f"{count}: {listed}")
