@@ -1,0 +1,223 @@
+"""The 26 games of Atari 100k, played on the Arcade Learning Environment itself.
+
+The semantics are DreamerV3's, with three differences. The time limit cuts a game and does
+not end it. An observation never shows frames of before the reset or the step. And every
+reset leads to the same game: ALE's own leaves the console's memory and random numbers as
+they were, and in at least ten of the games what follows depends on them.
+"""
+
+from __future__ import annotations
+
+import difflib
+from typing import Any
+
+import numpy as np
+
+from vawm.envs.host.frames import make_resize
+from vawm.envs.host.simulator import Outcome
+from vawm.envs.protocol import check_positive
+from vawm.errors import InvalidInput
+from vawm.types import PyTree, image
+
+GAMES = {
+    "alien": "Alien",
+    "amidar": "Amidar",
+    "assault": "Assault",
+    "asterix": "Asterix",
+    "bank_heist": "BankHeist",
+    "battle_zone": "BattleZone",
+    "boxing": "Boxing",
+    "breakout": "Breakout",
+    "chopper_command": "ChopperCommand",
+    "crazy_climber": "CrazyClimber",
+    "demon_attack": "DemonAttack",
+    "freeway": "Freeway",
+    "frostbite": "Frostbite",
+    "gopher": "Gopher",
+    "hero": "Hero",
+    "jamesbond": "Jamesbond",
+    "kangaroo": "Kangaroo",
+    "krull": "Krull",
+    "kung_fu_master": "KungFuMaster",
+    "ms_pacman": "MsPacman",
+    "pong": "Pong",
+    "private_eye": "PrivateEye",
+    "qbert": "Qbert",
+    "road_runner": "RoadRunner",
+    "seaquest": "Seaquest",
+    "up_n_down": "UpNDown",
+}
+"""Name of the ROM -> name in tables of scores."""
+
+LIFE_LOSSES = ("ignore", "terminal", "end")
+NOOP = 0  # ALE's number of the action that does nothing, in every game
+
+
+class AtariSimulator:
+    """One game as a `Simulator`; observations are `[image_size, image_size, 3]` uint8.
+
+    An observation is the maximum of the last frames of a step at full resolution, made
+    smaller. The first one is the screen after the no-ops, alone; a step that is cut short
+    has fewer frames to choose from.
+
+    Args:
+      game: one of `GAMES`.
+      frame_skip: frames that a step plays, fewer where the episode ends among them.
+      pooling: frames at the end of a step of which the maximum is seen, at most those of
+        the step.
+      image_size: pixels a side.
+      resize: "bilinear" as Pillow, "area" as OpenCV; see `make_resize`.
+      noops: an episode begins with a random number of frames without action, 0 to this
+        many, drawn from its seed. They count neither as steps nor for `max_frames`.
+      sticky: probability that a frame repeats the action of the frame before, in [0, 1).
+      life_loss: what losing a life does where the game goes on. "ignore": nothing.
+        "terminal": `is_terminal` without `is_last`; the game is that of "ignore". "end":
+        the episode ends at that frame, and the next reset begins a new game, not the rest
+        of this one, which would depend on what was played before.
+      clip_reward: only the sign of a step's reward is given.
+      max_frames: of an episode, which then is cut: `is_last` without `is_terminal`.
+      full_action_set: all 18 actions, not only those that do something in the game.
+
+    Raises:
+      InvalidInput: an unknown game or choice, an impossible number, or no ale-py.
+    """
+
+    obs: PyTree
+    action_size: int
+    discrete: bool = True
+    episode_length: int | None = None
+
+    def __init__(
+        self,
+        game: str,
+        *,
+        frame_skip: int,
+        pooling: int,
+        image_size: int,
+        resize: str,
+        noops: int,
+        sticky: float,
+        life_loss: str,
+        clip_reward: bool,
+        max_frames: int,
+        full_action_set: bool,
+    ):
+        check_game(game)
+        check_positive("frame_skip", frame_skip)
+        check_positive("pooling", pooling)
+        check_positive("image_size", image_size)
+        check_positive("max_frames", max_frames)
+        if isinstance(noops, bool) or not isinstance(noops, int) or noops < 0:
+            raise InvalidInput("noops", noops, "use a whole number of at least 0")
+        if not 0 <= sticky < 1:
+            raise InvalidInput("sticky", sticky, "use a probability below 1, 0 for none")
+        if life_loss not in LIFE_LOSSES:
+            remedy = f"choose one of {', '.join(LIFE_LOSSES)}"
+            raise InvalidInput("life_loss", life_loss, remedy)
+
+        self._ale = load(game)
+        self._loaded = self._ale.cloneState(include_rng=True)
+        actions = "getLegalActionSet" if full_action_set else "getMinimalActionSet"
+        self._actions = getattr(self._ale, actions)()
+        height, width = self._ale.getScreenDims()
+        self._screens = np.empty((min(pooling, frame_skip), height, width, 3), np.uint8)
+        self._resize = make_resize(resize, height=height, width=width, size=image_size)
+        self._frame_skip = frame_skip
+        self._noops = noops
+        self._sticky = sticky
+        self._life_loss = life_loss
+        self._clip_reward = clip_reward
+        self._max_frames = max_frames
+        self.obs = image(image_size)
+        self.action_size = len(self._actions)
+
+    def reset(self, seed: int) -> np.ndarray:
+        """Begins the game of this seed: its no-ops and its sticky frames."""
+        self._random = np.random.default_rng(seed)
+        self._restart()
+        for _ in range(self._random.integers(self._noops + 1)):
+            self._ale.act(NOOP)
+            if self._over():
+                self._restart()
+        self._held = NOOP
+        self._lives = self._ale.lives()
+        self._frames = 0
+        self._ale.getScreenRGB(self._screens[0])
+        return self._resize(self._screens[0])
+
+    def step(self, action: np.ndarray | int) -> Outcome:
+        """Plays the action of this index for a frame skip."""
+        if not 0 <= int(action) < self.action_size:
+            remedy = f"use the index of an action, 0 to {self.action_size - 1}"
+            raise InvalidInput("action", action, remedy)
+        chosen = self._actions[int(action)]
+        reward, played = 0.0, 0
+        lost = over = is_last = False
+        while played < self._frame_skip and not is_last:
+            if self._random.random() >= self._sticky:
+                self._held = chosen
+            reward += self._ale.act(self._held)
+            self._ale.getScreenRGB(self._screens[played % len(self._screens)])
+            played += 1
+            self._frames += 1
+            over = self._over()
+            lives = self._ale.lives()
+            # Not "and still above 0": the last life of bank_heist counts as 0.
+            lost |= lives < self._lives and not over
+            self._lives = lives
+            ended = over or (lost and self._life_loss == "end")
+            is_last = ended or self._frames >= self._max_frames
+        return Outcome(
+            obs=self._resize(self._screens[:played].max(axis=0)),
+            reward=float(np.sign(reward)) if self._clip_reward else reward,
+            is_last=is_last,
+            is_terminal=over or (lost and self._life_loss != "ignore"),
+        )
+
+    def close(self) -> None:
+        """Lets go of the console."""
+        self._ale = self._loaded = None
+
+    def _restart(self) -> None:
+        """Begins the one game there is.
+
+        A saved state lacks parts of the video chip and the screen, and a reset lacks the
+        memory, the cartridge and the random numbers of the console: the one after the other
+        misses nothing. It leads to the game that loading and one reset lead to.
+        """
+        self._ale.restoreState(self._loaded)
+        self._ale.reset_game()
+
+    def _over(self) -> bool:
+        return self._ale.game_over(with_truncation=False)
+
+
+def check_game(name: str) -> None:
+    """Refuses a name outside `GAMES`, with the nearest one."""
+    if name in GAMES:
+        return
+    close = difflib.get_close_matches(str(name).lower(), GAMES, n=1)
+    hint = f"did you mean {close[0]!r}? " if close else ""
+    raise InvalidInput("game", name, f"{hint}choose one of {', '.join(GAMES)}")
+
+
+def load(game: str) -> Any:
+    """An `ALEInterface` with the game just loaded, silent but for errors.
+
+    ALE's own sticky actions are off: their random numbers are not ours to seed by episode.
+    Frame skip 1, no time limit, no end at a lost life and the game's usual mode and
+    difficulty are ALE's defaults.
+    """
+    try:
+        import ale_py
+        from ale_py import roms
+    except ImportError as missing:
+        remedy = 'Atari needs ale-py: pip install "vawm[atari]"'
+        raise InvalidInput("game", game, remedy) from missing
+
+    ale_py.ALEInterface.setLoggerMode(ale_py.LoggerMode.Error)
+    ale = ale_py.ALEInterface()
+    ale.setFloat("repeat_action_probability", 0.0)
+    ale.setInt("random_seed", 0)  # else the clock
+    ale.loadROM(str(roms.get_rom_path(game)))
+    return ale
