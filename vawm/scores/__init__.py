@@ -1,0 +1,160 @@
+"""Published scores to compare with, and the numbers that sum up Atari 100k.
+
+    table                rows                        from
+    atari100k            26 games                    the paper, Table 1
+    atari100k_dreamerv3  26 games                    the paper, Table 5
+    atari100k_storm      26 games                    the paper, Table 6
+    dmc_vision_1m        20 tasks, 1M steps          the paper, Table 2, left
+    dmc_proprio_500k     18 tasks, 500K frames       score files published with the agents;
+                                                     the rerun from the paper, Table 2, right
+
+`_var` is an agent with value alignment, as the paper has it. `dreamerv3` and `storm` in the
+first table are the paper's own runs, `_reproduced` in the second and third, where `_reported`
+is what the agents' authors print and `storm_meo2024` what Meo et al. (2024) do.
+Of dmc_proprio_500k's rerun 15 tasks can be read in print, with value alignment none; over all
+18 the paper prints means of 805 without and 817 with it, and medians of 881 and 901.
+BattleZone's human score is 37187.7 in the paper's tables, 37187.5 in most others.
+"""
+
+from __future__ import annotations
+
+import csv
+import difflib
+import functools
+import math
+import re
+import statistics
+from collections.abc import Iterable, Mapping
+from importlib import resources
+from typing import NamedTuple
+
+from vawm.errors import InvalidInput
+
+TABLES = (
+    "atari100k",
+    "atari100k_dreamerv3",
+    "atari100k_storm",
+    "dmc_vision_1m",
+    "dmc_proprio_500k",
+)
+
+
+class Game(NamedTuple):
+    """What a score in one game is measured against.
+
+    Attributes:
+      name: as printed, "BankHeist".
+      random: score of uniformly random play.
+      human: score of the human.
+    """
+
+    name: str
+    random: float
+    human: float
+
+
+class Aggregate(NamedTuple):
+    """Human-normalised scores of some games, summed up.
+
+    Attributes:
+      mean: over the games.
+      median: over the games.
+      superhuman: games with more than the human's score.
+      games: how many there are; only 26 compare with what is published.
+    """
+
+    mean: float
+    median: float
+    superhuman: int
+    games: int
+
+
+def table(name: str) -> dict[str, dict[str, float]]:
+    """Reads a table: row -> column -> score, with nothing where nothing is printed.
+
+    Args:
+      name: one of `TABLES`. Games are named as printed, tasks of DMC as everywhere here.
+
+    Raises:
+      InvalidInput: an unknown name.
+    """
+    if name not in TABLES:
+        raise InvalidInput("table", name, remedy(name, TABLES))
+    text = resources.files(__name__).joinpath(f"{name}.csv").read_text(encoding="utf-8")
+    header, *rows = csv.reader(text.splitlines())
+    return {
+        row[0]: {
+            column: float(score)
+            for column, score in zip(header[1:], row[1:], strict=True)
+            if score
+        }
+        for row in rows
+    }
+
+
+def human_normalized(game: str, score: float) -> float:
+    """(score - random) / (human - random): 0 for random play, 1 for the human's.
+
+    Args:
+      game: as a task, "bank_heist", or as printed, "BankHeist".
+      score: mean return of whole games, in the game's own points.
+
+    Raises:
+      InvalidInput: an unknown game, or a score that is not finite.
+    """
+    _, random, human = find_game(game)
+    if not math.isfinite(score):
+        raise InvalidInput(game, score, "a score has to be a finite number")
+    return (score - random) / (human - random)
+
+
+def aggregate(scores: Mapping[str, float]) -> Aggregate:
+    """Sums up the human-normalised scores of games, named as in `human_normalized`.
+
+    Raises:
+      InvalidInput: an unknown game, no game, one under both of its names, or a score that
+        is not finite.
+    """
+    if not scores:
+        raise InvalidInput("scores", scores, "give the score of at least one game")
+    names = [find_game(game).name for game in scores]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise InvalidInput("scores", twice, "give each game once, under one of its names")
+    normalized = [human_normalized(game, score) for game, score in scores.items()]
+    return Aggregate(
+        mean=statistics.fmean(normalized),
+        median=statistics.median(normalized),
+        superhuman=sum(score > 1 for score in normalized),
+        games=len(normalized),
+    )
+
+
+def find_game(name: str) -> Game:
+    """The game of either name; refuses others, with the nearest one."""
+    for task, game in games().items():
+        if name in (task, game.name):
+            return game
+    raise InvalidInput("game", name, remedy(name, games()))
+
+
+@functools.cache
+def games() -> dict[str, Game]:
+    """The 26 games by the name of their task."""
+    return {
+        snake_case(name): Game(name, row["random"], row["human"])
+        for name, row in table("atari100k").items()
+    }
+
+
+def snake_case(name: str) -> str:
+    """Turns "BankHeist" into "bank_heist"."""
+    return re.sub(r"(?<!^)(?=[A-Z])", "_", name).lower()
+
+
+def remedy(name: str, known: Iterable[str]) -> str:
+    """What to write instead of an unknown name: the nearest known one, or any."""
+    choices = list(known)
+    close = difflib.get_close_matches(str(name).lower(), choices, n=1)
+    hint = f"did you mean {close[0]!r}? " if close else ""
+    return f"{hint}choose one of {', '.join(choices)}"
