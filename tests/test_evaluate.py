@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 import tiny
 
-from vawm import checkpoint, evaluate, policy, train
+from vawm import checkpoint, evaluate, play, policy, train
 from vawm.agent import make_agent
 from vawm.envs import probes
 from vawm.errors import InvalidInput
-from vawm.evaluate import Score
+from vawm.play import Score
 from vawm.policy import Policy
-from vawm.types import EnvSpec
+from vawm.types import EnvSpec, vector
 
-CARTPOLE = EnvSpec("cartpole_balance", (5,), "float32", 1, False, 2, 5, 200)
+CARTPOLE = EnvSpec("cartpole_balance", vector(5), 1, False, 2, 5, 200)
 
 
 def scripted(spec, action):
@@ -27,7 +27,7 @@ def scripted(spec, action):
         env_steps=0,
         params=None,
         initial=lambda n: jnp.zeros(n),
-        apply=lambda params, key, carry, timestep: (
+        apply=lambda params, key, carry, timestep, how: (
             carry,
             jnp.full((carry.shape[0], 1), action),
         ),
@@ -60,24 +60,16 @@ def test_the_seed_decides():
 
 def test_no_episodes_are_refused():
     with pytest.raises(InvalidInput, match="episodes=0: use a number of at least 1"):
-        evaluate.evaluate(scripted(CARTPOLE, 0.0), episodes=0)
-
-
-def test_actions_are_clipped_and_stretched_to_the_actuators():
-    low, high = np.array([-2.0, 0.0]), np.array([2.0, 1.0])
-    raw = np.array([[-3.0, -1.0], [0.0, 0.5], [1.0, 7.0]])
-    np.testing.assert_allclose(
-        evaluate.to_actuator(raw, low, high), [[-2.0, 0.0], [0.0, 0.75], [2.0, 1.0]]
-    )
+        evaluate.dmc_proprio(scripted(CARTPOLE, 0.0), episodes=0)
 
 
 def test_the_same_policy_plays_in_the_simulation_of_dm_control():
     """Still, a cartpole that starts upright falls within seconds: a middling return."""
-    still = evaluate.evaluate(scripted(CARTPOLE, 0.0), episodes=2, physics="mujoco")
+    still = evaluate.dmc_proprio(scripted(CARTPOLE, 0.0), episodes=2, physics="mujoco")
     assert all(100 < total < 900 for total in still.returns)
-    again = evaluate.evaluate(scripted(CARTPOLE, 0.0), episodes=2, physics="mujoco")
+    again = evaluate.dmc_proprio(scripted(CARTPOLE, 0.0), episodes=2, physics="mujoco")
     assert again == still
-    pushed = evaluate.evaluate(scripted(CARTPOLE, 5.0), episodes=2, physics="mujoco")
+    pushed = evaluate.dmc_proprio(scripted(CARTPOLE, 5.0), episodes=2, physics="mujoco")
     assert pushed.mean < still.mean
 
 
@@ -110,7 +102,7 @@ def test_parameters_are_arguments_of_the_compiled_program(saved):
     first = policy.load(saved[0])
     second = policy.load(saved[0])
     second = second._replace(params=jax.tree.map(lambda x: x + 1, second.params))
-    texts = [evaluate.player(env, p).lower(p.params, key).as_text() for p in (first, second)]
+    texts = [play.player(env, p).lower(p.params, key).as_text() for p in (first, second)]
     assert texts[0] == texts[1]
 
 
@@ -121,7 +113,7 @@ def test_the_command_line_reports_each_simulation(saved, monkeypatch, capsys):
         asked.append(kwargs)
         return Score((1.0, 3.0))
 
-    monkeypatch.setattr(evaluate, "evaluate", fake)
+    monkeypatch.setitem(evaluate.PROTOCOLS, "dmc_proprio", fake)
     monkeypatch.setattr(evaluate.cache, "enable", lambda: None)
     arguments = ["--logdir", str(saved[0]), "--episodes", "2", "--physics", "mujoco"]
     assert evaluate.main(arguments) == 0
@@ -153,4 +145,4 @@ def test_bad_input_is_one_line_and_code_2(tmp_path, capsys, monkeypatch, flags, 
 @pytest.mark.parametrize("seed", [-1, 2**31])
 def test_an_impossible_seed_is_refused(seed):
     with pytest.raises(InvalidInput, match="seed="):
-        evaluate.evaluate(scripted(CARTPOLE, 0.0), episodes=1, seed=seed)
+        evaluate.dmc_proprio(scripted(CARTPOLE, 0.0), episodes=1, seed=seed)

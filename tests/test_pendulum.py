@@ -46,7 +46,7 @@ def test_both_simulations_report_whole_episodes(logdir, capsys):
     flags = ["--logdir", str(logdir), "--episodes", "2", "--physics", "mujoco"]
     assert evaluate.main(flags) == 0
     title, *scores = capsys.readouterr().out.splitlines()
-    assert title.startswith("pendulum_swingup at 3000 env steps")
+    assert title.startswith("pendulum_swingup (dmc_proprio) at 3000 env steps")
     assert [score.split()[0] for score in scores] == ["mjx", "mujoco"]
     for score in scores:
         assert score.endswith("over 2 episodes")

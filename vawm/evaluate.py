@@ -1,96 +1,68 @@
-"""Scores of a trained policy, in the simulation it learned in and in dm_control's own.
+"""Scores of a trained policy: one named protocol per suite, and the command line.
 
-    python -m vawm.evaluate --logdir runs/... --episodes 10 --physics mujoco
+    python -m vawm.evaluate --logdir runs/...
 
-The policy is sampled, as in training.
+    dmc_proprio   10 episodes, on MJX or in dm_control's own simulation
+    dmc_vision    10 episodes
+    atari100k     100 games to their end, whole scores, no sticky actions; human-normalised
+    gymnasium     20 episodes
+
+Actions are sampled, as in training and in the official DreamerV3; `how="mode"` takes the
+policy's mode. Every episode that is begun to be counted is counted, once.
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-import math
-import os
 import pathlib
 import sys
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import jax
-import jax.numpy as jnp
-import numpy as np
 
-from vawm import cache, envs, flags, huge_pages
+from vawm import cache, envs, flags, huge_pages, play, scores, suites
 from vawm import policy as policy_lib
 from vawm.command_line import guard
-from vawm.envs.protocol import Environment
+from vawm.config import HostEnvConfig
+from vawm.envs.protocol import Environment, HostEnvironment
 from vawm.errors import InvalidInput
+from vawm.play import How, Score
 from vawm.policy import Policy
-from vawm.types import Array, TimeStep
 
-
-class Score(NamedTuple):
-    """Returns of whole episodes.
-
-    Attributes:
-      returns: one number per episode.
-    """
-
-    returns: tuple[float, ...]
-
-    @property
-    def mean(self) -> float:
-        return float(np.mean(self.returns))
-
-    @property
-    def standard_error(self) -> float:
-        """Of the mean; NaN for a single episode."""
-        if len(self.returns) < 2:
-            return math.nan
-        return float(np.std(self.returns, ddof=1) / math.sqrt(len(self.returns)))
-
-    def __str__(self) -> str:
-        count = len(self.returns)
-        return f"{self.mean:.1f} +- {self.standard_error:.1f} over {count} episodes"
-
-
-class Loop(NamedTuple):
-    """Carry of `play`."""
-
-    env_state: Any
-    timestep: TimeStep
-    carry: Any
-    key: Array
-    done: Array  # [N] whether the first episode is over
-    total: Array  # [N] its return so far
+AT_ONCE = 8
+"""Environments on the host that are stepped together, each with its share of the episodes."""
 
 
 def evaluate(
     policy: Policy,
     *,
     episodes: int,
-    physics: Literal["mjx", "mujoco"] = "mjx",
+    env: Environment | HostEnvironment,
+    how: How = "sample",
     seed: int = 0,
-    env: Environment | None = None,
 ) -> Score:
-    """Plays `episodes` whole episodes of the policy's task.
+    """Plays `episodes` whole episodes in any environments.
 
     Args:
       policy: what `vawm.load` returns.
-      episodes: played side by side.
-      physics: "mjx" for the simulation of training, "mujoco" for dm_control's.
+      episodes: a jittable environment plays them side by side, with `num_envs == episodes`.
+      env: what to play in; one on the host stays open.
+      how: actions are sampled, or the policy's mode.
       seed: of the episodes and of the actions.
-      env: in place of the MJX task; has `num_envs == episodes`.
 
     Raises:
       InvalidInput: a number of episodes that is not positive, or an impossible seed.
+      EnvironmentFailure: an environment on the host failed.
     """
     check(episodes, seed)
-    if physics == "mujoco":
-        return _evaluate_mujoco(policy, episodes, seed)
-    env = env or envs.make(
-        policy.spec.task, num_envs=episodes, action_repeat=policy.spec.action_repeat
-    )
-    returns = player(env, policy)(policy.params, jax.random.key(seed))
+    if not isinstance(env, Environment):
+        return play.on_host(env, policy, episodes=episodes, seed=seed, how=how)
+    if env.spec.num_envs != episodes:
+        remedy = f"the environments are {env.spec.num_envs}, one for each; use that"
+        raise InvalidInput("episodes", episodes, remedy)
+    returns = play.player(env, policy, how)(policy.params, jax.random.key(seed))
     return Score(tuple(map(float, returns)))
 
 
@@ -106,109 +78,129 @@ def check(episodes: int, seed: int) -> None:
         raise InvalidInput("seed", seed, f"use a number from 0 to {2**31 - 1}")
 
 
-def player(env: Environment, policy: Policy) -> jax.stages.Wrapped:
-    """`(params, key) -> returns`, jitted: the same program for every checkpoint of a run."""
-    return jax.jit(lambda params, key: play(env, policy._replace(params=params), key))
+def dmc_proprio(
+    policy: Policy,
+    *,
+    episodes: int = 10,
+    physics: Literal["mjx", "mujoco"] = "mjx",
+    how: How = "sample",
+    seed: int = 0,
+) -> Score:
+    """Episodes of 1000 control steps, in the simulation of training or in dm_control's."""
+    check(episodes, seed)
+    if physics == "mujoco":
+        return play.in_mujoco(policy, episodes=episodes, seed=seed, how=how)
+    spec = policy.spec
+    env = envs.make(spec.task, num_envs=episodes, action_repeat=spec.action_repeat)
+    return evaluate(policy, episodes=episodes, env=env, how=how, seed=seed)
 
 
-def play(env: Environment, policy: Policy, key: Array) -> Array:
-    """Returns `[N]` of the first episode in each of N environments."""
-    num_envs = env.spec.num_envs
-    key_reset, key_act = jax.random.split(key)
-
-    def one_step(loop: Loop) -> Loop:
-        key, key_act = jax.random.split(loop.key)
-        carry, action = policy.act(key_act, loop.carry, loop.timestep)
-        env_state, timestep = env.step(loop.env_state, action)
-        return Loop(
-            env_state=env_state,
-            timestep=timestep,
-            carry=carry,
-            key=key,
-            done=loop.done | timestep.is_last,
-            total=loop.total + jnp.where(loop.done, 0.0, timestep.reward),
-        )
-
-    env_state, timestep = env.reset(key_reset)
-    first = Loop(
-        env_state=env_state,
-        timestep=timestep,
-        carry=policy.initial(num_envs),
-        key=key_act,
-        done=jnp.zeros(num_envs, bool),
-        total=jnp.zeros(num_envs),
-    )
-    return jax.lax.while_loop(lambda loop: ~loop.done.all(), one_step, first).total
+def dmc_vision(
+    policy: Policy, *, episodes: int = 10, how: How = "sample", seed: int = 0
+) -> Score:
+    """Episodes of 1000 control steps, rendered as in training."""
+    return _on_host(policy, episodes=episodes, how=how, seed=seed)
 
 
-def _evaluate_mujoco(policy: Policy, episodes: int, seed: int) -> Score:
-    os.environ.setdefault("MUJOCO_GL", "disable")  # nothing is rendered
-    from dm_control import suite
+def atari100k(
+    policy: Policy,
+    *,
+    episodes: int = 100,
+    how: How = "sample",
+    sticky: float = 0.0,
+    seed: int = 0,
+) -> Score:
+    """Whole games with their whole scores, whatever the training called an end or clipped.
 
-    domain, task = envs.split(policy.spec.task)
-    sims = [suite.load(domain, task, {"random": seed + i}) for i in range(episodes)]
-    specs = sims[0].action_spec()
-    latest = [sim.reset() for sim in sims]
-    total = np.zeros(episodes)
-    carry, key = policy.initial(episodes), jax.random.key(seed)
-    is_first = True
-    while not all(step.last() for step in latest):
-        key, key_act = jax.random.split(key)
-        carry, action = policy.act(key_act, carry, _as_timestep(latest, is_first))
-        controls = to_actuator(np.asarray(action), specs.minimum, specs.maximum)
-        for i, (sim, control) in enumerate(zip(sims, controls, strict=True)):
-            for _ in range(policy.spec.action_repeat):
-                if not latest[i].last():
-                    latest[i] = sim.step(control)
-                    total[i] += latest[i].reward
-        is_first = False
-    return Score(tuple(map(float, total)))
+    Frames, no-ops and the length limit are those of training; sticky actions are off unless
+    `sticky` is their probability.
+    """
+    changes = {"sticky": sticky, "life_loss": "ignore", "clip_reward": False}
+    return _on_host(policy, episodes=episodes, how=how, seed=seed, **changes)
 
 
-def to_actuator(action: np.ndarray, minimum: np.ndarray, maximum: np.ndarray) -> np.ndarray:
-    """Raw actions, clipped to [-1, 1] and stretched to the actuator's range."""
-    unit = (np.clip(action, -1.0, 1.0) + 1.0) / 2.0
-    return minimum + unit * (maximum - minimum)
+def gymnasium(
+    policy: Policy, *, episodes: int = 20, how: How = "sample", seed: int = 0
+) -> Score:
+    """Episodes of a registered environment."""
+    return _on_host(policy, episodes=episodes, how=how, seed=seed)
 
 
-def _as_timestep(steps: Sequence[Any], is_first: bool) -> TimeStep:
-    """dm_env's steps of N simulations as one `TimeStep`; entries in dm_control's order."""
-    obs = [np.concatenate([np.ravel(x) for x in s.observation.values()]) for s in steps]
-    last = np.array([step.last() for step in steps])
-    return TimeStep(
-        obs=jnp.asarray(np.stack(obs), jnp.float32),
-        reward=jnp.asarray([step.reward or 0.0 for step in steps], jnp.float32),
-        is_first=jnp.full(len(steps), is_first),
-        is_last=jnp.asarray(last),
-        is_terminal=jnp.zeros(len(steps), bool),
-    )
+PROTOCOLS = {
+    "dmc_proprio": dmc_proprio,
+    "dmc_vision": dmc_vision,
+    "atari100k": atari100k,
+    "gymnasium": gymnasium,
+}
+
+
+def _on_host(policy: Policy, *, episodes: int, how: How, seed: int, **changes: Any) -> Score:
+    """In the environments of the policy's own config, with some of its choices changed."""
+    check(episodes, seed)
+    assert isinstance(policy.config.env, HostEnvConfig)
+    choices = dataclasses.replace(policy.config.env, on_failure="raise", **changes)
+    config = dataclasses.replace(policy.config, num_envs=min(episodes, AT_ONCE), env=choices)
+    with contextlib.closing(suites.on_host(config, choices)) as env:
+        return evaluate(policy, episodes=episodes, env=env, how=how, seed=seed)
 
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Evaluate the newest checkpoint of a run."""
+    """Evaluate the newest checkpoint of a run by the protocol of its suite."""
 
     logdir: pathlib.Path
     """folder of the run"""
-    episodes: int = 10
+    episodes: int | None = None
+    """as many as the protocol has if not given"""
+    how: Literal["sample", "mode"] = "sample"
+    """sample actions from the policy, or take its mode"""
     physics: Literal["mjx", "mujoco"] = "mjx"
-    """mujoco: also in dm_control's own C simulation"""
+    """mujoco: also in dm_control's own C simulation; for dmc_proprio"""
+    sticky: float = 0.0
+    """probability of sticky actions; for atari100k"""
     seed: int = 0
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Prints a line per simulation; returns the exit code."""
     arguments = flags.read(Arguments, argv, description=__doc__)
-    check(arguments.episodes, arguments.seed)
+    check(1 if arguments.episodes is None else arguments.episodes, arguments.seed)
     cache.enable()
     policy = policy_lib.load(arguments.logdir)
-    print(f"{policy.spec.task} at {policy.env_steps} env steps, mean +- standard error")
-    for physics in ("mjx", "mujoco") if arguments.physics == "mujoco" else ("mjx",):
-        score = evaluate(
-            policy, episodes=arguments.episodes, physics=physics, seed=arguments.seed
-        )
-        print(f"  {physics:6} {score}", flush=True)
+    suite, task = policy.config.suite, policy.spec.task
+    variants = _variants(arguments, suite)
+    print(f"{task} ({suite}) at {policy.env_steps} env steps, mean +- standard error")
+    common: dict[str, Any] = {"how": arguments.how, "seed": arguments.seed}
+    if arguments.episodes is not None:
+        common["episodes"] = arguments.episodes
+    for name, choices in variants.items():
+        score = PROTOCOLS[suite](policy, **common, **choices)
+        text = f"  {name:6} {score}"
+        if suite == "atari100k":
+            normalized = scores.human_normalized(task, score.mean)
+            text += f", {normalized:.3f} human-normalised"
+        print(text, flush=True)
     return 0
+
+
+def _variants(arguments: Arguments, suite: str) -> dict[str, dict[str, Any]]:
+    """Name -> what its protocol is told besides the usual.
+
+    Raises:
+      InvalidInput: an option that is not of this suite.
+    """
+    if arguments.physics != "mjx" and suite != "dmc_proprio":
+        raise InvalidInput("physics", arguments.physics, f"is not an option of {suite}")
+    if arguments.sticky and suite != "atari100k":
+        raise InvalidInput("sticky", arguments.sticky, f"is not an option of {suite}")
+    if not 0 <= arguments.sticky < 1:
+        raise InvalidInput("sticky", arguments.sticky, "use a number from 0 up to 1")
+    if suite == "atari100k":
+        return {"ale": {"sticky": arguments.sticky}}
+    if suite != "dmc_proprio":
+        return {arguments.how: {}}
+    simulations = ("mjx", "mujoco") if arguments.physics == "mujoco" else ("mjx",)
+    return {name: {"physics": name} for name in simulations}
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 
@@ -23,7 +23,8 @@ class Policy(NamedTuple):
       env_steps: when the checkpoint was written.
       params: the parameters.
       initial: `(batch_size) -> carry`, before the first observation.
-      apply: `(params, key, carry, timestep) -> (carry, action [N, A])`, jitted and pure.
+      apply: `(params, key, carry, timestep, *, how) -> (carry, action [N, A])`, jitted and
+        pure.
     """
 
     config: Config
@@ -31,13 +32,17 @@ class Policy(NamedTuple):
     env_steps: int
     params: Params
     initial: Callable[[int], PolicyCarry]
-    apply: Callable[[Params, Key, PolicyCarry, TimeStep], tuple[PolicyCarry, Array]]
+    apply: Callable[..., tuple[PolicyCarry, Array]]
 
     def act(
-        self, key: Key, carry: PolicyCarry, timestep: TimeStep
+        self,
+        key: Key,
+        carry: PolicyCarry,
+        timestep: TimeStep,
+        how: Literal["sample", "mode"] = "sample",
     ) -> tuple[PolicyCarry, Array]:
-        """The next carry and a raw action `[N, A]`, sampled as in training."""
-        return self.apply(self.params, key, carry, timestep)
+        """The next carry and a raw action `[N, A]`: sampled, or the policy's mode."""
+        return self.apply(self.params, key, carry, timestep, how=how)
 
 
 def load(logdir: str | os.PathLike[str]) -> Policy:
@@ -56,5 +61,5 @@ def load(logdir: str | os.PathLike[str]) -> Policy:
         env_steps=manifest.env_steps,
         params=params,
         initial=agent.initial,
-        apply=jax.jit(agent.act),
+        apply=jax.jit(agent.act, static_argnames="how"),
     )
