@@ -1,5 +1,6 @@
 """Runs on disk, and what two of them must have in common."""
 
+import contextlib
 import io
 import struct
 
@@ -42,7 +43,8 @@ def events(logdir):
 
 def assert_same(actual, expected, config, env=None):
     """Two whole runs of `config`: the same state bit for bit, the same lines."""
-    shapes = runner.prepare(config, env).shapes
+    with contextlib.closing(runner.prepare(config, env)) as program:
+        shapes = program.shapes
     (state, manifest), (other, other_manifest) = (
         checkpoint.restore(logdir, shapes) for logdir in (actual, expected)
     )

@@ -22,9 +22,11 @@ LAYERS = {
     "optim": {"config"},
     "nets": {"types"},
     "replay": {"types"},
+    "image_store": {"replay", "types"},
+    "scores": {"errors"},
     "envs": {"errors", "types"},
     "world_model": {"config", "distributions", "errors", "nets", "transforms", "types"},
-    "actor_critic": {"config", "distributions", "nets", "transforms", "types"},
+    "actor_critic": {"config", "distributions", "errors", "nets", "transforms", "types"},
     "imagination": {"distributions", "types", "world_model"},
     "agent": {"actor_critic", "config", "types", "world_model"},
     "objective": {
@@ -36,7 +38,30 @@ LAYERS = {
         "transforms",
         "types",
     },
-    "train": {"agent", "config", "envs", "objective", "optim", "replay", "returns", "types"},
+    "open_loop": {"agent", "objective", "types"},
+    "collector": {"agent", "config", "envs", "replay", "types"},
+    "learner": {
+        "agent",
+        "config",
+        "image_store",
+        "objective",
+        "optim",
+        "replay",
+        "returns",
+        "types",
+    },
+    "train": {"agent", "collector", "config", "envs", "learner", "replay", "types"},
+    "host_train": {
+        "agent",
+        "collector",
+        "config",
+        "envs",
+        "image_store",
+        "learner",
+        "replay",
+        "train",
+        "types",
+    },
 }
 HOST = {
     "checkpoint",
@@ -46,14 +71,18 @@ HOST = {
     "flags",
     "manifest",
     "memory",
+    "play",
     "policy",
+    "program",
     "resume",
     "rundir",
     "runner",
+    "suites",
     "tracking",
     "validate",
+    "video",
 }
-SOLE_IMPORTERS = {"flax": {"nets"}, "distrax": {"distributions"}, "optax": {"optim", "train"}}
+SOLE_IMPORTERS = {"flax": {"nets"}, "distrax": {"distributions"}, "optax": {"learner", "optim"}}
 
 
 def rooms():

@@ -9,15 +9,18 @@ import pytest
 import tiny
 
 from vawm import config as config_lib
-from vawm import memory, train
+from vawm import host_train, image_store, memory, train
 from vawm.agent import make_agent
 from vawm.envs import probes
 from vawm.errors import InvalidInput
 from vawm.memory import Estimate
+from vawm.types import EnvSpec, image
 
 NEEDED = Estimate(
+    where="device",
     replay=1000 * 2**20,
     replay_capacity=1000,
+    images=0,
     params=100 * 2**20,
     optimizer=200 * 2**20,
     other_state=0,
@@ -31,7 +34,7 @@ def test_the_state_is_counted_exactly():
     env = tiny.env()
     agent = make_agent(tiny.CONFIG, env.spec)
     state = jax.eval_shape(lambda k: train.init(env, agent, tiny.CONFIG, k), jax.random.key(0))
-    needed = memory.estimate(state, tiny.CONFIG)
+    (needed,) = memory.estimate(state, env.spec, tiny.CONFIG)
     total = needed.replay + needed.params + needed.optimizer + needed.other_state
     assert total == memory.nbytes(state)
     assert needed.params == memory.nbytes(jax.eval_shape(agent.init, jax.random.key(0)))
@@ -47,37 +50,110 @@ def test_keys_and_small_types_are_counted_in_bytes():
     assert memory.nbytes(tree) == 3 * 8 + 5 * 2
 
 
+def check(needed, device, host=None, *, capacity=1000, **smallest):
+    replay = dataclasses.replace(tiny.CONFIG.replay, capacity=capacity)
+    config = tiny.config(replay=replay)
+    memory.check([needed], {"device": device, "host": host}, config, **smallest)
+
+
 def test_what_fits_is_accepted():
-    memory.check(NEEDED, NEEDED.total, configured=1000)
-    memory.check(NEEDED, None, configured=1000)
+    check(NEEDED, NEEDED.total)
+    check(NEEDED, None)
 
 
 def test_what_does_not_fit_is_refused_with_the_largest_replay_that_would():
     with pytest.raises(InvalidInput) as error:
-        memory.check(NEEDED, 1500 * 2**20, configured=5000)
+        check(NEEDED, 1500 * 2**20, capacity=5000)
     assert str(error.value).startswith(
         "replay.capacity=5000: needs 1.95 GiB for a run that fills 1000 of it, 1.46 GiB are"
     )
     assert str(error.value).endswith("use replay.capacity=500 at most")
 
 
+@pytest.mark.parametrize("images", [0, 3000 * 2**20])
 @pytest.mark.parametrize("copies", [1, 2])
-def test_the_replay_that_is_named_fits_and_a_larger_one_does_not(copies):
-    needed = NEEDED._replace(copies=copies)
+def test_the_replay_that_is_named_fits_and_a_larger_one_does_not(copies, images):
+    needed = NEEDED._replace(copies=copies, images=images)
     available = int(0.6 * needed.total)
     with pytest.raises(InvalidInput) as error:
-        memory.check(needed, available, configured=1000)
+        check(needed, available)
     largest = int(error.value.remedy.split("replay.capacity=")[1].split()[0])
     for capacity, fits in [(largest, True), (largest + 1, False)]:
-        replay = needed.replay // needed.replay_capacity * capacity
-        total = needed._replace(replay=replay, replay_capacity=capacity).total
+        rings = [size // needed.replay_capacity * capacity for size in (needed.replay, images)]
+        total = needed._replace(
+            replay=rings[0], images=rings[1], replay_capacity=capacity
+        ).total
         assert (total <= available) == fits
 
 
 def test_a_replay_too_small_to_learn_from_is_not_named():
-    memory.check(NEEDED, NEEDED.total, configured=1000, smallest=501)
+    check(NEEDED, NEEDED.total, smallest=501)
     with pytest.raises(InvalidInput, match="use a smaller size or batch"):
-        memory.check(NEEDED, 1500 * 2**20, configured=1000, smallest=501)
+        check(NEEDED, 1500 * 2**20, smallest=501)
+
+
+def pixels(monkeypatch, backend, images="device", env_steps=20_000_000):
+    """Estimates for 5 million images of 64 x 64 x 3 in replay, and the config."""
+    config = dataclasses.replace(
+        config_lib.VISION_PAPER,
+        env_steps=env_steps,
+        replay=dataclasses.replace(config_lib.VISION_PAPER.replay, images=images),
+    )
+    spec = EnvSpec("test", image(64), 6, False, config.num_envs, 2, 500)
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    agent = make_agent(config, spec)
+    timestep = host_train.first_timestep(spec)
+    state = jax.eval_shape(
+        lambda key, timestep: host_train.init(spec, agent, config, key, timestep),
+        jax.random.key(0),
+        timestep,
+    )
+    if images == "host":
+        capacity = state.replay.trajectory.reward.shape[1]
+        ring = image_store.specs(spec.obs, num_envs=config.num_envs, capacity=capacity)
+        state = state._replace(images=ring)
+    return memory.estimate(state, spec, config), config
+
+
+FIVE_MILLION = 5_000_000 * 64 * 64 * 3
+
+
+def test_five_million_images_are_refused_with_the_numbers(monkeypatch):
+    needed, config = pixels(monkeypatch, "gpu")
+    assert pytest.approx(57.2, abs=0.1) == FIVE_MILLION / 2**30
+    assert needed[0].replay_capacity == 5_000_000
+    assert needed[0].replay > FIVE_MILLION
+    free = {"device": 70 * 2**30, "host": 900 * 2**30}
+    with pytest.raises(InvalidInput) as error:
+        memory.check(needed, free, config)
+    assert error.value.field == "replay.capacity"
+    assert "70.00 GiB are free (replay 7" in str(error.value)  # latents take the rest
+    assert error.value.remedy.endswith("or replay.images='host' if that has more memory")
+
+
+def test_images_on_the_host_are_counted_there(monkeypatch):
+    (device, host), config = pixels(monkeypatch, "gpu", images="host")
+    assert (device.where, host.where) == ("device", "host")
+    assert device.images == 0
+    assert host.images == FIVE_MILLION
+    assert device.replay < FIVE_MILLION < host.total
+    memory.check((device, host), {"device": 80 * 2**30, "host": 128 * 2**30}, config)
+    with pytest.raises(InvalidInput, match=r"in host memory .* use replay.capacity=") as error:
+        memory.check((device, host), {"device": 80 * 2**30, "host": 60 * 2**30}, config)
+    assert "replay.images" not in str(error.value)
+
+
+@pytest.mark.parametrize("images", ["device", "host"])
+def test_on_a_cpu_there_is_one_memory_for_both(monkeypatch, images):
+    (needed,), _ = pixels(monkeypatch, "cpu", images=images)
+    assert needed.where == "device"
+    assert needed.replay + needed.images > FIVE_MILLION
+    assert needed.copies == 2
+
+
+def test_a_run_is_charged_for_no_more_images_than_it_collects(monkeypatch):
+    (device, _), _ = pixels(monkeypatch, "gpu", env_steps=1_000_000)
+    assert device.replay_capacity == 16 * (31_250 + 63)  # decisions, and a reset per 500
 
 
 # GiB at the peak, on a CPU with 2 cores: cartpole_swingup, and walker_walk until a few
@@ -99,13 +175,14 @@ def test_the_estimate_is_not_below_what_was_measured_nor_far_above(
     env = env._replace(spec=env.spec._replace(action_repeat=config.action_repeat))
     agent = make_agent(config, env.spec)
     state = jax.eval_shape(lambda key: train.init(env, agent, config, key), jax.random.key(0))
-    total = memory.estimate(state, config).total
+    (needed,) = memory.estimate(state, env.spec, config)
+    total = needed.total
     assert measured < total / 2**30 < 1.4 * measured
 
 
 def test_a_model_that_does_not_fit_alone_is_not_blamed_on_replay():
     with pytest.raises(InvalidInput, match="use a smaller size or batch"):
-        memory.check(NEEDED, 900 * 2**20, configured=1000)
+        check(NEEDED, 900 * 2**20)
 
 
 def test_free_memory_is_known_here():

@@ -18,8 +18,8 @@ from runs import assert_same, events, lines, measured, quiet
 from tensorboardX.proto.event_pb2 import SessionLog
 
 from vawm import checkpoint, envs, memory, runner
-from vawm.envs import Environment
 from vawm.errors import InvalidInput
+from vawm.program import Program
 
 LONG = tiny.config(env_steps=192)
 
@@ -43,12 +43,6 @@ class FakeStep:
     def __init__(self, loss):
         self._loss = loss
 
-    def lower(self, _):
-        return self
-
-    def compile(self):
-        return self
-
     def __call__(self, state):
         state = state._replace(env_steps=state.env_steps + 8)
         loss = self._loss(int(state.env_steps))
@@ -67,9 +61,17 @@ def fake(monkeypatch):
     """Puts a `FakeStep` with the given losses in place of training."""
 
     def install(loss=lambda env_steps: env_steps):
-        env = Environment(toy.SPEC, None, None)
-        start = runner.Start(env, lambda key: toy.state(), FakeStep(loss), None)
-        monkeypatch.setattr(runner, "prepare", lambda *_: start)
+        program = Program(
+            spec=toy.SPEC,
+            agent=None,
+            shapes=None,
+            init=lambda seed: toy.state(),
+            compile=lambda state: FakeStep(loss),
+            episodes=lambda: None,
+            resume=lambda state, _: (state, 0),
+            close=lambda: None,
+        )
+        monkeypatch.setattr(runner, "prepare", lambda *_: program)
 
     return install
 
@@ -195,7 +197,7 @@ def test_bad_input_is_refused_with_nothing_written(tmp_path, changes):
 
 
 def test_a_run_that_does_not_fit_is_refused_with_nothing_written(tmp_path, monkeypatch):
-    monkeypatch.setattr(memory, "available_bytes", lambda: 1000)
+    monkeypatch.setattr(memory, "available", lambda: {"device": 1000})
     with pytest.raises(InvalidInput, match=r"replay.capacity=64: needs .* are free"):
         run(tiny.CONFIG, tmp_path / "run")
     assert not list(tmp_path.iterdir())

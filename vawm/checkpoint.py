@@ -3,6 +3,8 @@
     <logdir>/checkpoints/<env_steps>/
         params/          Orbax: what is needed to act
         state/           Orbax: everything else (optimiser, replay, environments, keys, ...)
+        images/          Orbax: replayed images, where they are kept on the host
+        episodes/        Orbax: what environments on the host did since their last reset
         manifest.json    config, environment spec, counters, leaves, SHA-256 of every file
         manifest.sha256
 
@@ -33,7 +35,9 @@ from vawm.errors import InvalidInput
 from vawm.manifest import LeafInfo, Manifest, leaf_info
 from vawm.types import EnvSpec, PyTree
 
-PARAMS_PREFIX = ".learner.params"
+PREFIXES = {"params": ".learner.params", "images": ".images", "state": ""}
+"""Item -> what its paths begin with; the first that fits has a leaf."""
+ON_HOST = ("images", "episodes")  # these stay arrays of numpy
 SCRATCH = "tmp-"
 
 Leaves = dict[str, Any]
@@ -80,8 +84,11 @@ def save(
     config: Config,
     spec: EnvSpec,
     progress: Mapping[str, Any],
+    episodes: Leaves | None = None,
 ) -> pathlib.Path:
     """Writes a `TrainState`; deletes older checkpoints once the new one is complete.
+
+    `episodes` are arrays of any shape beside it, see `restore_episodes`.
 
     Raises:
       SaveError: nothing was changed, because the disk is full or a parameter not finite.
@@ -90,6 +97,8 @@ def save(
     if final.exists():
         return final
     items = _items(flatten(state))
+    if episodes is not None:
+        items["episodes"] = dict(episodes)
     _refuse_nonfinite(items["params"])
     infos = {
         item: {path: leaf_info(leaf) for path, leaf in leaves.items()}
@@ -131,10 +140,24 @@ def restore(logdir: str | os.PathLike[str], target: PyTree) -> tuple[PyTree, Man
     path, manifest = read_manifest(logdir)
     expected = _items(flatten(target))
     leaves: Leaves = {}
-    for item, prefix in (("params", PARAMS_PREFIX), ("state", "")):
-        values = _read(path, manifest, item, expected[item])
-        leaves |= {prefix + name: value for name, value in values.items()}
+    for item, wanted in expected.items():
+        values = _read(path, manifest, item, wanted)
+        leaves |= {PREFIXES[item] + name: value for name, value in values.items()}
     return unflatten(target, leaves), manifest
+
+
+def restore_episodes(logdir: str | os.PathLike[str]) -> dict[str, np.ndarray] | None:
+    """The arrays that were saved as `episodes`; None where there are none.
+
+    Raises:
+      InvalidInput: a file is damaged.
+    """
+    path, manifest = read_manifest(logdir)
+    infos = manifest.leaves.get("episodes")
+    if infos is None:
+        return None
+    expected = {name: np.zeros(info.shape, info.dtype) for name, info in infos.items()}
+    return _read(path, manifest, "episodes", expected)
 
 
 def restore_params(logdir: str | os.PathLike[str], target: PyTree) -> tuple[PyTree, Manifest]:
@@ -158,16 +181,12 @@ def unflatten(target: PyTree, leaves: Leaves) -> PyTree:
 
 
 def _items(leaves: Leaves) -> dict[str, Leaves]:
-    """The items `params` and `state`; paths of the first start at `Params`."""
-    is_param = {path: path.startswith(PARAMS_PREFIX) for path in leaves}
-    return {
-        "params": {
-            path.removeprefix(PARAMS_PREFIX): leaf
-            for path, leaf in leaves.items()
-            if is_param[path]
-        },
-        "state": {path: leaf for path, leaf in leaves.items() if not is_param[path]},
-    }
+    """Leaves by item, their paths without its prefix; items without leaves are left out."""
+    items: dict[str, Leaves] = {}
+    for path, leaf in leaves.items():
+        item = next(item for item, prefix in PREFIXES.items() if path.startswith(prefix))
+        items.setdefault(item, {})[path.removeprefix(PREFIXES[item])] = leaf
+    return items
 
 
 def _refuse_nonfinite(params: Leaves) -> None:
@@ -188,7 +207,7 @@ def _write(path: pathlib.Path, leaves: Leaves) -> None:
 
 def _read(path: pathlib.Path, manifest: Manifest, item: str, expected: Leaves) -> Leaves:
     infos = {name: leaf_info(leaf) for name, leaf in expected.items()}
-    _compare(path / item, manifest.leaves[item], infos)
+    _compare(path / item, manifest.leaves.get(item, {}), infos)
     manifest_lib.verify(path, manifest, item)
     stored = [name for name, info in infos.items() if info.nbytes]
     with _checkpointer() as checkpointer:
@@ -198,7 +217,12 @@ def _read(path: pathlib.Path, manifest: Manifest, item: str, expected: Leaves) -
                 restore_args={name: ocp.RestoreArgs(restore_type=np.ndarray) for name in stored}
             ),
         )
-    return {name: _as_leaf(arrays.get(name), expected[name]) for name in infos}
+    as_leaf = _as_array if item in ON_HOST else _as_leaf
+    return {name: as_leaf(arrays.get(name), expected[name]) for name in infos}
+
+
+def _as_array(array: np.ndarray | None, like: Any) -> np.ndarray:
+    return np.zeros(like.shape, like.dtype) if array is None else array
 
 
 def _as_leaf(array: np.ndarray | None, like: Any) -> jax.Array:

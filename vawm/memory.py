@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import os
 import pathlib
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import jax
 
-from vawm.config import Config
+from vawm import nets
+from vawm.config import Config, HostEnvConfig
 from vawm.errors import InvalidInput
 from vawm.manifest import leaf_info
-from vawm.types import PyTree
+from vawm.types import EnvSpec, PyTree, is_image
 
 CGROUP_LIMITS = [
     (
@@ -31,20 +34,28 @@ PROCESS_BYTES = 2600 * 2**20
 A `quick` run of cartpole peaks at 2.5 GiB (glibc's huge pages on), of which 0.1 are its
 state. Rounded up, since larger domains compile longer."""
 COMPILER_BYTES = 400 * 2**20  # of an accelerator's memory, for its context and programs
+WORKER_BYTES = 400 * 2**20
+"""Of each process with environments: imports and a rendering context."""
 WORKING_FACTOR = 4
 """Measured per counted activation: 0.7 GB at size 1m for a batch of 16 x 64, 3.3 times
 what `working_bytes` counts; rounded up."""
+IMAGE_FACTOR = 3
+"""Measured per number in the maps of images."""
 
 
 class Estimate(NamedTuple):
-    """Bytes that a run needs; `replay_capacity` is what `replay` holds, in steps.
+    """Bytes that a run needs of one memory; `replay_capacity` is what `replay` holds, in steps.
 
-    `copies` of replay, parameters, optimiser and other state are in the same memory at
-    once: two where a checkpoint is written from, and read into, the memory of the run.
+    `where` is "device", or "host" for the memory of the machine beside an accelerator; on a
+    CPU both are one, called device. `images` are those that replay keeps on the host. `copies`
+    of what a checkpoint holds are in the same memory at once: two where it is written from,
+    and read into, the memory of the run.
     """
 
+    where: str
     replay: int
     replay_capacity: int
+    images: int
     params: int
     optimizer: int
     other_state: int
@@ -54,7 +65,7 @@ class Estimate(NamedTuple):
 
     @property
     def state(self) -> int:
-        return self.replay + self.params + self.optimizer + self.other_state
+        return self.replay + self.images + self.params + self.optimizer + self.other_state
 
     @property
     def total(self) -> int:
@@ -63,36 +74,46 @@ class Estimate(NamedTuple):
     def __str__(self) -> str:
         parts = {
             "replay": self.replay,
+            "images on the host": self.images,
             "parameters": self.params,
             "optimiser": self.optimizer,
             "environments and the rest": self.other_state,
             "a copy of these for checkpoints": (self.copies - 1) * self.state,
             "working memory": self.working,
-            "the process": self.process,
+            "processes": self.process,
         }
         return ", ".join(f"{name} {readable(size)}" for name, size in parts.items() if size)
 
 
-def estimate(state: PyTree, config: Config) -> Estimate:
-    """What a run takes; exact for its state, on the high side for the rest.
+def estimate(state: PyTree, spec: EnvSpec, config: Config) -> tuple[Estimate, ...]:
+    """What a run takes of each memory; exact for its state, on the high side for the rest.
 
     Args:
       state: the `TrainState`; shapes and dtypes are enough.
+      spec: of the environments.
       config: of the run.
     """
     replay, params = nbytes(state.replay), nbytes(state.learner.params)
-    optimizer = nbytes(state.learner.opt_state)
+    images, optimizer = nbytes(state.images), nbytes(state.learner.opt_state)
     num_envs, per_env = state.replay.trajectory.reward.shape
-    return Estimate(
+    device = Estimate(
+        where="device",
         replay=replay,
         replay_capacity=num_envs * per_env,
+        images=0,
         params=params,
         optimizer=optimizer,
-        other_state=nbytes(state) - replay - params - optimizer,
-        working=working_bytes(config) + 2 * params,  # gradient and update
-        process=process_bytes(),
-        copies=2 if jax.default_backend() == "cpu" else 1,
+        other_state=nbytes(state) - replay - images - params - optimizer,
+        working=working_bytes(spec, config) + 2 * params,  # gradient and update
+        process=COMPILER_BYTES,
+        copies=1,
     )
+    process = PROCESS_BYTES + worker_bytes(config)
+    if jax.default_backend() == "cpu":
+        return (device._replace(images=images, process=process, copies=2),)
+    # The state passes through the host's memory on its way to and from a checkpoint.
+    host = device._replace(where="host", images=images, working=0, process=process)
+    return device, host
 
 
 def process_bytes() -> int:
@@ -100,16 +121,24 @@ def process_bytes() -> int:
     return PROCESS_BYTES if jax.default_backend() == "cpu" else COMPILER_BYTES
 
 
+def worker_bytes(config: Config) -> int:
+    """What the processes of environments on the host take."""
+    if not isinstance(config.env, HostEnvConfig):
+        return 0
+    return WORKER_BYTES * (config.env.workers or min(config.num_envs, os.cpu_count() or 1))
+
+
 def nbytes(tree: PyTree) -> int:
     """Bytes of all leaves; arrays or shapes."""
     return sum(leaf_info(leaf).nbytes for leaf in jax.tree.leaves(tree))
 
 
-def working_bytes(config: Config) -> int:
+def working_bytes(spec: EnvSpec, config: Config) -> int:
     """Rule of thumb for the activations of one update, in bytes.
 
     Counts float32 numbers per replayed step (observe, forward and kept for backward) and
-    per imagined state (features, actor, critic and its logits), `WORKING_FACTOR` times.
+    per imagined state (features, actor, critic and its logits), `WORKING_FACTOR` times, and
+    the maps of images, `IMAGE_FACTOR` times.
     """
     model, critic = config.world_model, config.critic
     feature = model.deter + model.stoch * model.classes
@@ -125,7 +154,26 @@ def working_bytes(config: Config) -> int:
     imagined = 2 * feature + config.actor.layers * config.actor.units + 4 * critic.bins
     steps = config.replay.batch_steps
     numbers = steps * (observed + (config.imagination.horizon + 1) * imagined)
-    return 4 * WORKING_FACTOR * numbers
+    maps = steps * _image_maps(spec, config)
+    return 4 * (WORKING_FACTOR * numbers + IMAGE_FACTOR * maps)
+
+
+def _image_maps(spec: EnvSpec, config: Config) -> int:
+    """Numbers in the maps of encoder and decoder for one observation's images."""
+    images = [leaf for leaf in jax.tree.leaves(spec.obs) if is_image(leaf)]
+    if not images:
+        return 0
+    size, channels = images[0].shape[0], sum(image.shape[2] for image in images)
+    numbers = 2 * size * size * channels  # what is read, and what is predicted
+    for stage, width in enumerate(nets.STAGE_WIDTHS):
+        side = size // 2**stage
+        numbers += 2 * side * side * width * config.world_model.depth
+    return numbers
+
+
+def available() -> dict[str, int | None]:
+    """Free memory by the names of `Estimate.where`; None where it is not known."""
+    return {"device": available_bytes(), "host": _available_on_host()}
 
 
 def available_bytes() -> int | None:
@@ -175,33 +223,51 @@ def _text(path: str) -> str:
 
 
 def check(
-    needed: Estimate, available: int | None, *, configured: int, smallest: int = 1
+    needed: Sequence[Estimate],
+    available: Mapping[str, int | None],
+    config: Config,
+    *,
+    smallest: int = 1,
 ) -> None:
     """Refuses a run that cannot fit, and names the replay that would.
 
     Args:
-      needed: by the run.
-      available: free memory, None where that is not known.
-      configured: `replay.capacity`, of which a short run allocates only a part.
+      needed: by the run, of each memory.
+      available: free memory, see `available`.
+      config: of the run; a short run allocates only a part of its replay.
       smallest: steps in replay with which the run could still learn.
 
     Raises:
       InvalidInput: with the numbers.
     """
-    if available is None or needed.total <= available:
-        return
+    for need in needed:
+        free = available[need.where]
+        if free is not None and need.total > free:
+            raise _too_large(need, free, config, smallest)
+
+
+def _too_large(need: Estimate, free: int, config: Config, smallest: int) -> InvalidInput:
+    whose = " in host memory" if need.where == "host" else ""
     numbers = (
-        f"needs {readable(needed.total)} for a run that fills {needed.replay_capacity} of it, "
-        f"{readable(available)} are free ({needed}); "
+        f"needs {readable(need.total)}{whose} for a run that fills {need.replay_capacity} of "
+        f"it, {readable(free)} are free ({need}); "
     )
-    step = needed.copies * needed.replay / needed.replay_capacity
-    rest = needed.total - needed.copies * needed.replay
-    largest = int((available - rest) / step)
+    rings = need.replay + need.images
+    step = need.copies * rings / need.replay_capacity
+    rest = need.total - need.copies * rings
+    largest = int((free - rest) / step)
     if largest < smallest:
         remedy = "no replay is small enough: use a smaller size or batch, or fewer num_envs"
     else:
         remedy = f"use replay.capacity={largest} at most"
-    raise InvalidInput("replay.capacity", configured, numbers + remedy)
+    if need.where == "device" and jax.default_backend() != "cpu" and _could_move(config):
+        remedy += ", or replay.images='host' if that has more memory"
+    return InvalidInput("replay.capacity", config.replay.capacity, numbers + remedy)
+
+
+def _could_move(config: Config) -> bool:
+    """Whether replay keeps images on the device that could be on the host."""
+    return isinstance(config.env, HostEnvConfig) and config.replay.images == "device"
 
 
 def readable(size: float) -> str:

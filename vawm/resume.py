@@ -7,6 +7,7 @@ import pathlib
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from vawm import checkpoint, rundir, tracking, validate
 from vawm.config import CUSTOM, Config
@@ -15,7 +16,12 @@ from vawm.manifest import Manifest
 from vawm.replay import Replay
 from vawm.types import PyTree
 
-MAY_DIFFER = ("env_steps", "log_every", "save_every")
+MAY_DIFFER = (
+    *("env_steps", "log_every", "save_every"),
+    *("video.every", "video.sequences", "video.context", "video.episode_steps"),
+    *("env.workers", "env.timeout", "env.on_failure"),
+)
+"""What changes neither what a run learns nor what it has stored."""
 
 
 def saved_config(logdir: str | os.PathLike[str]) -> Config:
@@ -82,30 +88,37 @@ def restore(logdir: str | os.PathLike[str], shapes: PyTree) -> tuple[PyTree, Man
     saved = manifest.leaves["state"].get(".replay.trajectory.reward")
     wanted = shapes.replay.trajectory.reward.shape[1]
     capacity = saved.shape[1] if saved else wanted
-    target = shapes._replace(replay=_with_capacity(shapes.replay, capacity))
+    target = shapes._replace(
+        replay=_with_capacity(shapes.replay, capacity),
+        images=_with_capacity(shapes.images, capacity),
+    )
     state, manifest = checkpoint.restore(logdir, target)
     if wanted > capacity:
-        state = state._replace(replay=grow(state.replay, wanted))
+        state = state._replace(
+            replay=grow(state.replay, wanted),
+            images=grow_images(state.images, state.replay, wanted),
+        )
     return state, manifest
 
 
-def _with_capacity(replay: Replay, capacity: int) -> Replay:
+def _with_capacity(rings: PyTree, capacity: int) -> PyTree:
+    """Shapes `[N, C, ...]` with another C; counters and empty arrays stay as they are."""
+
     def reshape(x: jax.ShapeDtypeStruct) -> jax.ShapeDtypeStruct:
-        if x.ndim < 2:
+        if x.ndim < 2 or not x.shape[1]:
             return x
         return jax.ShapeDtypeStruct((x.shape[0], capacity, *x.shape[2:]), x.dtype)
 
-    return jax.tree.map(reshape, replay)
+    return jax.tree.map(reshape, rings)
 
 
 def grow(replay: Replay, capacity: int) -> Replay:
     """The same steps in a larger buffer, the oldest first."""
     old = replay.trajectory.reward.shape[1]
-    oldest = (int(replay.head) - int(replay.size)) % old
 
     def pad(x: jax.Array) -> jax.Array:
         widths = [(0, 0), (0, capacity - old)] + [(0, 0)] * (x.ndim - 2)
-        return jnp.pad(jnp.roll(x, -oldest, axis=1), widths)
+        return jnp.pad(jnp.roll(x, -_oldest(replay), axis=1), widths)
 
     return Replay(
         trajectory=jax.tree.map(pad, replay.trajectory),
@@ -113,3 +126,21 @@ def grow(replay: Replay, capacity: int) -> Replay:
         head=replay.size % capacity,
         size=replay.size,
     )
+
+
+def grow_images(images: PyTree, replay: Replay, capacity: int) -> PyTree:
+    """The images of `replay` as `grow` moves its steps, in host memory."""
+
+    def pad(x: np.ndarray) -> np.ndarray:
+        if not x.size:
+            return x
+        larger = np.zeros((x.shape[0], capacity, *x.shape[2:]), x.dtype)
+        larger[:, : x.shape[1]] = np.roll(x, -_oldest(replay), axis=1)
+        return larger
+
+    return jax.tree.map(pad, images)
+
+
+def _oldest(replay: Replay) -> int:
+    """Where the oldest step lies."""
+    return (int(replay.head) - int(replay.size)) % replay.trajectory.reward.shape[1]

@@ -114,6 +114,6 @@ def read_config(logdir: pathlib.Path) -> Config | None:
 
 def clear(logdir: pathlib.Path) -> None:
     """Removes what a run measured that saved nothing; it is about to measure it again."""
-    for pattern in ("metrics.jsonl*", "events.out.tfevents.*"):
+    for pattern in ("metrics.jsonl*", "events.out.tfevents.*", "videos.jsonl*", "videos/*"):
         for path in logdir.glob(pattern):
             path.unlink()

@@ -18,12 +18,13 @@ from typing import Any, NamedTuple
 import jax
 import rich.console
 
-from vawm import checkpoint, envs, memory, rundir, signals, tracking, train, validate
+from vawm import checkpoint, memory, rundir, signals, suites, tracking, validate, video
+from vawm import program as program_lib
 from vawm import resume as resume_lib
-from vawm.agent import make_agent
 from vawm.config import Config
 from vawm.display import Display
-from vawm.envs.protocol import Environment
+from vawm.envs.protocol import Environment, EnvironmentFailure, HostEnvironment
+from vawm.program import Program
 from vawm.tracking import Interval, Line
 from vawm.types import PyTree
 
@@ -64,21 +65,12 @@ class Result(NamedTuple):
     exit_code: int
 
 
-class Start(NamedTuple):
-    """What is known of a run before its first step; nothing is allocated yet."""
-
-    env: Environment
-    init: Callable[[jax.Array], PyTree]
-    step: jax.stages.Wrapped  # (state) -> (state, metrics), donates
-    shapes: PyTree
-
-
 def run(
     config: Config,
     logdir: str | pathlib.Path,
     *,
     resume: bool = False,
-    env: Environment | None = None,
+    env: Environment | HostEnvironment | None = None,
     console: rich.console.Console | None = None,
     banner: str = "",
     command: str = "the same command",
@@ -90,35 +82,40 @@ def run(
       logdir: a folder that is empty or not there yet; of the run to resume otherwise.
       resume: continue from the newest checkpoint in `logdir`, or from the start where a
         run was stopped before its first.
-      env: an environment in place of the one that `config.task` names.
+      env: an environment in place of the one that `config.task` names; one on the host is
+        closed at the end.
       console: where progress goes; standard output by default.
       banner: printed once the run is known to start.
       command: how the caller was started, for the advice at the end.
 
     Raises:
       InvalidInput: before anything is compiled, allocated or written.
-      RunError: a loss is not finite, memory ran out, or the disk is full.
+      RunError: a loss is not finite, an environment failed, memory ran out, or the disk is
+        full.
       SaveError: a checkpoint could not be written.
     """
     logdir = pathlib.Path(logdir).expanduser()
     console = console or rich.console.Console()
+    say = functools.partial(console.print, highlight=False, soft_wrap=True, markup=False)
     check(config, logdir, resume=resume, known_task=env is None)
-    start = prepare(config, env)
-    with _disk_explained(logdir), _out_of_memory_explained(), rundir.claim(logdir):
+    with (
+        contextlib.closing(prepare(config, env)) as program,
+        _explained(logdir),
+        rundir.claim(logdir),
+    ):
         if banner:
-            console.print(banner, highlight=False, soft_wrap=True, markup=False)
+            say(banner)
         if resume and checkpoint.latest(logdir):
-            state, progress = _continue(logdir, start)
+            state, progress = _continue(logdir, program, say)
             rundir.write_config(logdir, config)
         else:
             if resume:
                 rundir.clear(logdir)
-                text = f"no checkpoint in {logdir} yet: this run starts from the beginning"
-                console.print(text, highlight=False, soft_wrap=True, markup=False)
+                say(f"no checkpoint in {logdir} yet: this run starts from the beginning")
             rundir.write_config(logdir, config)
-            state, progress = start.init(jax.random.key(config.seed)), Progress()
-        result = _loop(config, logdir, start, state, progress, console)
-    _summarise(config, result, console, command)
+            state, progress = program.init(config.seed), Progress()
+        result = _loop(config, logdir, program, state, progress, console)
+    _summarise(config, result, say, command)
     return result
 
 
@@ -130,9 +127,9 @@ def check(
     Raises:
       InvalidInput: names field, value and remedy.
     """
-    if known_task:
-        envs.check_task(config.task)
     validate.check(config)
+    if known_task:
+        suites.check_task(config)
     if resume:
         resume_lib.check(logdir, config)
         rundir.check_writable(logdir)
@@ -140,48 +137,55 @@ def check(
         rundir.check_new(logdir)
 
 
-def prepare(config: Config, env: Environment | None = None) -> Start:
+def prepare(config: Config, env: Environment | HostEnvironment | None = None) -> Program:
     """Builds the run's functions and refuses one that does not fit into memory.
 
     Raises:
       InvalidInput: with the numbers, and the largest replay that would fit.
     """
-    if env is None:
-        env = envs.make(
-            config.task, num_envs=config.num_envs, action_repeat=config.action_repeat
+    program = program_lib.make(config, env)
+    try:
+        memory.check(
+            memory.estimate(program.shapes, program.spec, config),
+            memory.available(),
+            config,
+            smallest=validate.smallest_replay(config),
         )
-    agent = make_agent(config, env.spec)
-    init = jax.jit(functools.partial(train.init, env, agent, config))
-    shapes = init.eval_shape(jax.random.key(0))
-    memory.check(
-        memory.estimate(shapes, config),
-        memory.available_bytes(),
-        configured=config.replay.capacity,
-        smallest=validate.smallest_replay(config),
-    )
-    step = jax.jit(train.make_train_step(env, agent, config), donate_argnums=0)
-    return Start(env, init, step, shapes)
+    except BaseException:
+        program.close()
+        raise
+    return program
 
 
-def _continue(logdir: pathlib.Path, start: Start) -> tuple[PyTree, Progress]:
-    state, manifest = resume_lib.restore(logdir, start.shapes)
+def _continue(
+    logdir: pathlib.Path, program: Program, say: Callable[[str], None]
+) -> tuple[PyTree, Progress]:
+    state, manifest = resume_lib.restore(logdir, program.shapes)
+    state, lost = program.resume(state, checkpoint.restore_episodes(logdir))
+    if lost:
+        say(
+            f"warning: {lost} of {program.spec.num_envs} environments did not do the same "
+            "again when their episodes were played once more; they begin new ones"
+        )
     saved = manifest.progress
     progress = Progress(**saved | {"interval": Interval(**saved["interval"])})
     tracking.truncate(logdir / "metrics.jsonl", progress.logged)
+    tracking.truncate(logdir / tracking.VIDEO_LINES, progress.env_steps)
     return state, progress
 
 
 def _loop(
     config: Config,
     logdir: pathlib.Path,
-    start: Start,
+    program: Program,
     state: PyTree,
     progress: Progress,
     console: rich.console.Console,
 ) -> Result:
     """Chunk after chunk; the only place where the device and the host meet."""
     display = Display(console, start=progress.env_steps, total=config.env_steps)
-    save = functools.partial(_save, logdir=logdir, config=config, spec=start.env.spec)
+    save = functools.partial(_save, logdir=logdir, config=config, program=program)
+    film = video.make(program, config)
     last_saved = progress.env_steps
     purge_after = progress.logged if progress.env_steps else None
     with (
@@ -190,7 +194,7 @@ def _loop(
         display,
     ):
         display.note("compiling (takes a minute the first time, seconds from then on) ...")
-        step = start.step.lower(state).compile()
+        step = program.compile(state)
         while progress.env_steps < config.env_steps and stop.signal is None:
             before, began = progress.env_steps, time.perf_counter()
             state, metrics = step(state)
@@ -205,6 +209,8 @@ def _loop(
                 progress = progress._replace(logged=progress.env_steps, interval=Interval())
             elif done:  # an incomplete interval, dropped again if the run is extended
                 tracker.write(_line(progress))
+            if film and _crossed(before, progress.env_steps, config.video.every):
+                tracker.write_videos(film(state), env_steps=progress.env_steps)
             if done or stop.signal or _crossed(before, progress.env_steps, config.save_every):
                 save(state, progress=progress)
                 last_saved = progress.env_steps
@@ -243,9 +249,23 @@ def _line(progress: Progress) -> Line:
     )
 
 
-def _save(state: PyTree, *, progress: Progress, **where: Any) -> None:
-    plain = progress._asdict() | {"interval": progress.interval._asdict()}
-    checkpoint.save(state=state, env_steps=progress.env_steps, progress=plain, **where)
+def _save(
+    state: PyTree,
+    *,
+    progress: Progress,
+    logdir: pathlib.Path,
+    config: Config,
+    program: Program,
+) -> None:
+    checkpoint.save(
+        logdir,
+        state,
+        env_steps=progress.env_steps,
+        config=config,
+        spec=program.spec,
+        progress=progress._asdict() | {"interval": progress.interval._asdict()},
+        episodes=program.episodes(),
+    )
 
 
 def _stop_if_nonfinite(
@@ -265,7 +285,11 @@ def _stop_if_nonfinite(
 
 
 @contextlib.contextmanager
-def _out_of_memory_explained():
+def _explained(logdir: pathlib.Path):
+    """One line for what ends a run from outside: memory, an environment, the disk.
+
+    Checkpoints have a `SaveError` of their own.
+    """
     try:
         yield
     except jax.errors.JaxRuntimeError as error:
@@ -274,13 +298,11 @@ def _out_of_memory_explained():
         first = str(error).splitlines()[0][:200]
         remedy = "use a smaller replay.capacity, replay.batch_size or size"
         raise RunError(f"out of memory: {remedy} ({first})") from error
-
-
-@contextlib.contextmanager
-def _disk_explained(logdir: pathlib.Path):
-    """What a run writes besides its checkpoints, which have a `SaveError` of their own."""
-    try:
-        yield
+    except EnvironmentFailure as error:
+        newest = checkpoint.latest(logdir)
+        kept = f"the checkpoint at {int(newest.name)}" if newest else "no checkpoint yet"
+        remedy = "to begin a new episode instead, start with --env.on-failure restart"
+        raise RunError(f"{error}; kept: {kept}; {remedy}") from error
     except OSError as error:
         raise RunError(
             f"{error.filename or logdir}: {error.strerror or error}; "
@@ -289,7 +311,7 @@ def _disk_explained(logdir: pathlib.Path):
 
 
 def _summarise(
-    config: Config, result: Result, console: rich.console.Console, command: str
+    config: Config, result: Result, say: Callable[[str], None], command: str
 ) -> None:
     lines = tracking.read(result.logdir / "metrics.jsonl")
     returns = [e["episode/return"] for e in lines if e.get("episode/return") is not None]
@@ -307,4 +329,4 @@ def _summarise(
         text.append(f"go on with: {command} --resume --logdir {result.logdir} {longer}")
     else:
         text.append(f"resume with: {command} --resume --logdir {result.logdir}")
-    console.print("\n".join(text), highlight=False, soft_wrap=True, markup=False)
+    say("\n".join(text))

@@ -13,16 +13,19 @@ import os
 import pathlib
 import socket
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from tensorboardX.proto.event_pb2 import Event, SessionLog
 from tensorboardX.proto.summary_pb2 import Summary
 from tensorboardX.record_writer import RecordWriter
 
+from vawm.video import Video, as_gif
+
 Line = dict[str, Any]
 
 COUNTERS = ("env_steps", "updates")
+VIDEOS, VIDEO_LINES = "videos", "videos.jsonl"
 EPISODE_SUMS = ("episode/return", "episode/length")
 
 
@@ -148,6 +151,17 @@ class Board:
         self._add(Event(step=entry["env_steps"], summary=Summary(value=values)))
         self._file.flush()
 
+    def write_video(self, name: str, gif: bytes, shape: Sequence[int], env_steps: int) -> None:
+        """Adds an animated GIF of `[T, H, W, 3]` frames, which TensorBoard plays."""
+        _, height, width, channels = shape
+        image = Summary.Image(
+            height=height, width=width, colorspace=channels, encoded_image_string=gif
+        )
+        self._add(
+            Event(step=env_steps, summary=Summary(value=[Summary.Value(tag=name, image=image)]))
+        )
+        self._file.flush()
+
     def _add(self, event: Event) -> None:
         event.wall_time = time.time()
         self._file.write(event.SerializeToString())
@@ -169,6 +183,7 @@ class Tracker:
     """
 
     def __init__(self, logdir: pathlib.Path, *, purge_after: int | None = None):
+        self._logdir = logdir
         self._file = (logdir / "metrics.jsonl").open("a")
         self._board = Board(logdir, purge_after=purge_after)
 
@@ -177,6 +192,20 @@ class Tracker:
         self._file.write(as_json(entry) + "\n")
         self._file.flush()
         self._board.write(entry)
+
+    def write_videos(self, videos: Sequence[Video], *, env_steps: int) -> None:
+        """Writes each as `videos/<name>-<env steps>.gif`, its numbers into `videos.jsonl`."""
+        folder = self._logdir / VIDEOS
+        for video in videos:
+            folder.mkdir(exist_ok=True)
+            gif, path = as_gif(video.frames), folder / f"{video.name}-{env_steps:012d}.gif"
+            scratch = path.with_suffix(".gif.tmp")
+            scratch.write_bytes(gif)
+            scratch.replace(path)
+            self._board.write_video(f"video/{video.name}", gif, video.frames.shape, env_steps)
+            entry = {"env_steps": env_steps, "video": path.name} | video.numbers
+            with (self._logdir / VIDEO_LINES).open("a") as file:
+                file.write(as_json(entry) + "\n")
 
     def __enter__(self) -> Tracker:
         return self

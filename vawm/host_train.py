@@ -1,0 +1,243 @@
+"""The training step where environments run on the host: the same functions, in a plain loop.
+
+    act, store            on the device
+    send the actions      the environments simulate from here on, in processes of their own
+    the updates due       on the device meanwhile; where images are kept on the host, the next
+                          batch is gathered and sent while the device still computes
+    receive what arrives
+
+so every action is that of the newest parameters, and simulation costs nothing that an update
+hides. Updates are single calls, not a loop on the device: XLA's convolutions on CPU are 16
+times slower inside a loop.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vawm import image_store, replay
+from vawm.agent import Agent
+from vawm.collector import Collector, arrive, begin, depart
+from vawm.config import Config
+from vawm.envs.protocol import HostEnvironment
+from vawm.learner import Learner, init_learner, make_update_at
+from vawm.replay import Replay
+from vawm.train import TrainState, empty_replay
+from vawm.types import EnvSpec, Key, Metrics, Params, PyTree, TimeStep
+
+HostStep = Callable[[TrainState], tuple[TrainState, dict[str, Any]]]
+
+
+class Compiled(NamedTuple):
+    """The three programs of a step.
+
+    Attributes:
+      depart: `(params, collector, replay, key) -> (collector, replay, key, key_learn)`.
+      arrive: `(collector, timestep) -> (collector, metrics)`.
+      update: `(learner, replay, positions, images, key_learn, number, env_steps) ->
+        (learner, replay, metrics)`.
+    """
+
+    depart: Callable[..., tuple[Collector, Replay, Key, Key]]
+    arrive: Callable[[Collector, TimeStep], tuple[Collector, Metrics]]
+    update: Callable[..., tuple[Learner, Replay, Metrics]]
+
+
+def init(
+    spec: EnvSpec, agent: Agent, config: Config, key: Key, timestep: TimeStep
+) -> TrainState:
+    """The state before the first step, but for `images`; `timestep` are first observations."""
+    key, key_learner = jax.random.split(key)
+    collector = begin(agent, timestep, (), num_envs=config.num_envs)
+    stored = collector
+    if config.replay.images == "host":
+        obs = image_store.without_images(timestep.obs)
+        stored = collector._replace(timestep=timestep._replace(obs=obs))
+    return TrainState(
+        learner=init_learner(agent, config, key_learner),
+        collector=collector,
+        replay=empty_replay(spec, stored, config),
+        credit=jnp.zeros((), jnp.int32),
+        key=key,
+    )
+
+
+def first_timestep(spec: EnvSpec) -> TimeStep:
+    """Shapes and dtypes of what arrives from environments of `spec`."""
+
+    def of(shape: tuple[int, ...], dtype: Any) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct((spec.num_envs, *shape), dtype)
+
+    flag = of((), jnp.bool_)
+    return TimeStep(
+        obs=jax.tree.map(lambda x: of(x.shape, x.dtype), spec.obs),
+        reward=of((), jnp.float32),  # type: ignore[arg-type]
+        is_first=flag,  # type: ignore[arg-type]
+        is_last=flag,  # type: ignore[arg-type]
+        is_terminal=flag,  # type: ignore[arg-type]
+    )
+
+
+def compile_programs(
+    spec: EnvSpec, agent: Agent, config: Config, state: TrainState
+) -> Compiled:
+    """Compiles the programs of a step for states like `state`; shapes are enough."""
+    key = jax.eval_shape(lambda: jax.random.key(0))
+    positions = jax.eval_shape(lambda: _positions(config))
+    images = jax.eval_shape(lambda: _batch_of_images(spec, config))
+    number = jax.ShapeDtypeStruct((), jnp.int32)
+    learner, collector, buffer = state.learner, state.collector, state.replay
+    timestep = first_timestep(spec)
+
+    def build(function: Callable, donate: tuple[int, ...], *arguments: Any) -> Any:
+        return jax.jit(function, donate_argnums=donate).lower(*arguments).compile()
+
+    return Compiled(
+        depart=build(
+            _make_depart(agent, config), (1, 2), learner.params, collector, buffer, key
+        ),
+        arrive=build(_make_arrive(spec), (0,), collector, timestep),
+        update=build(
+            _make_update(agent, config),
+            (0, 1),
+            *(learner, buffer, positions, images, key, number, number),
+        ),
+    )
+
+
+def make_step(env: HostEnvironment, config: Config, programs: Compiled) -> HostStep:
+    """Build `step(state) -> (state, metrics)`: collect K steps, then learn.
+
+    Counts, credit and metrics are those of `vawm.train.make_train_step`, with `env/restarts`
+    for `env/nonfinite`: environments begun anew after a failure. The state is used up:
+    `images` is written in place, the rest donated.
+
+    Raises:
+      EnvironmentFailure: in `step`, when an environment fails and may not be restarted.
+    """
+    learn = _make_learn(env.spec, config, programs.update)
+    on_host = config.replay.images == "host"
+
+    def step(state: TrainState) -> tuple[TrainState, dict[str, Any]]:
+        learner, collector, buffer, credit, key, images = state
+        restarts, arrived = env.restarts, []
+        for left in reversed(range(config.collect_steps)):
+            if on_host:
+                pending = jax.device_get(collector.timestep.obs)
+                image_store.add(images, pending, at=int(buffer.head))
+            collector, buffer, key, key_learn = programs.depart(
+                learner.params, collector, buffer, key
+            )
+            env.send(np.asarray(collector.carry.action))
+            if not left:
+                learner, buffer, credit, learned = learn(
+                    learner, buffer, images, credit, key_learn, collector.env_steps
+                )
+            collector, metrics = programs.arrive(collector, env.receive())
+            arrived.append(metrics)
+        arrived, learned, counters = jax.device_get(
+            (arrived, learned, {"env_steps": collector.env_steps, "updates": learner.step})
+        )
+        metrics = counters | {"chunk/updates": len(learned)}
+        metrics |= jax.tree.map(lambda *parts: sum(parts), *arrived)
+        metrics |= {"env/restarts": env.restarts - restarts} | _mean(learned)
+        return TrainState(learner, collector, buffer, credit, key, images), metrics
+
+    return step
+
+
+def _make_learn(spec: EnvSpec, config: Config, update: Callable) -> Callable:
+    """Build `learn(learner, replay, images, credit, key, env_steps)`: the updates due.
+
+    Batches are drawn with numpy, from the seed and the number of the update alone, so that
+    no draw waits for the device.
+    """
+    length, batch_steps = config.replay.batch_length, config.replay.batch_steps
+    earned = config.collect_steps * config.num_envs * config.train_ratio
+    on_host = config.replay.images == "host"
+
+    def learn(
+        learner: Learner,
+        buffer: Replay,
+        images: PyTree,
+        credit: Any,
+        key: Key,
+        env_steps: Any,
+    ) -> tuple[Learner, Replay, np.int32, list[Metrics]]:
+        capacity = buffer.trajectory.reward.shape[1]
+        head, size, done = (int(x) for x in (buffer.head, buffer.size, learner.step))
+        ready = spec.num_envs * (size - length) >= batch_steps
+        owed = int(credit) + (earned if ready else 0)
+        learned = []
+        for number in range(owed // batch_steps):
+            positions = replay.draw_on_host(
+                np.random.default_rng((config.seed, done + number)),
+                *(spec.num_envs, capacity, head, size),
+                batch_size=config.replay.batch_size,
+                length=length + 1,
+            )
+            batch = image_store.read(images, positions) if on_host else ()
+            learner, buffer, metrics = update(
+                *(learner, buffer, positions, batch, key, np.int32(number), env_steps)
+            )
+            learned.append(metrics)
+        return learner, buffer, np.int32(owed % batch_steps), learned
+
+    return learn
+
+
+def _make_depart(agent: Agent, config: Config) -> Callable:
+    def depart_and_store(params: Params, collector: Collector, buffer: Replay, key: Key):
+        key, key_act, key_learn = jax.random.split(key, 3)
+        collector, stored = depart(agent, params, collector, key_act)
+        if config.replay.images == "host":
+            obs = image_store.without_images(stored.trajectory.obs)
+            stored = stored._replace(trajectory=stored.trajectory._replace(obs=obs))
+        one_step = jax.tree.map(lambda x: x[:, None], stored)
+        return collector, replay.add(buffer, *one_step), key, key_learn
+
+    return depart_and_store
+
+
+def _make_arrive(spec: EnvSpec) -> Callable:
+    def take_in(collector: Collector, timestep: TimeStep):
+        return arrive(collector, timestep, action_repeat=spec.action_repeat)
+
+    return take_in
+
+
+def _make_update(agent: Agent, config: Config) -> Callable:
+    update_at = make_update_at(agent, config)
+
+    def update(learner, buffer, positions, images, key, number, env_steps):
+        key = jax.random.fold_in(key, number)
+        return update_at(learner, buffer, positions, images, key, env_steps)
+
+    return update
+
+
+def _positions(config: Config) -> replay.Positions:
+    batch, length = config.replay.batch_size, config.replay.batch_length + 1
+    return replay.Positions(jnp.zeros(batch, jnp.int32), jnp.zeros((batch, length), jnp.int32))
+
+
+def _batch_of_images(spec: EnvSpec, config: Config) -> PyTree:
+    """What `image_store.read` returns for a batch; `()` where replay has the images."""
+    if config.replay.images == "device":
+        return ()
+    shape = config.replay.batch_size, config.replay.batch_length + 1
+    images = jax.tree.map(lambda x: jnp.zeros((*shape, *x.shape), x.dtype), spec.obs)
+    empty = jax.tree.map(lambda x: jnp.zeros((*shape, 0), x.dtype), spec.obs)
+    return image_store.merge(empty, images)
+
+
+def _mean(learned: list[Metrics]) -> dict[str, float]:
+    """Means over the updates of a chunk; nothing where there were none."""
+    if not learned:
+        return {}
+    return {name: float(np.mean([m[name] for m in learned])) for name in learned[0]}

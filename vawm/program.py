@@ -1,0 +1,127 @@
+"""What the host loop runs: the functions of one run, on the device alone or with a host."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vawm import host_train, image_store, suites, train, validate
+from vawm.agent import Agent, make_agent
+from vawm.config import Config
+from vawm.envs.host.pool import Episodes
+from vawm.envs.protocol import Environment, HostEnvironment
+from vawm.train import TrainState
+from vawm.types import EnvSpec, PyTree
+
+Step = Callable[[TrainState], tuple[TrainState, Mapping[str, Any]]]
+Arrays = dict[str, np.ndarray]
+
+
+class Program(NamedTuple):
+    """The functions of a run; nothing is allocated before `init`.
+
+    Attributes:
+      spec: of the environments.
+      agent: what learns.
+      shapes: of the `TrainState`.
+      init: `(seed) -> state`.
+      compile: `(state) -> step`; a step uses its state up.
+      episodes: `() -> arrays` with which the running episodes can be played again; None
+        where the state holds the environments itself.
+      resume: `(state, episodes) -> (state, count)`: the environments as they were, of which
+        `count` could not be played again and begin new episodes.
+      close: stops what runs outside of the device.
+    """
+
+    spec: EnvSpec
+    agent: Agent
+    shapes: PyTree
+    init: Callable[[int], TrainState]
+    compile: Callable[[TrainState], Step]
+    episodes: Callable[[], Arrays | None]
+    resume: Callable[[TrainState, Arrays | None], tuple[TrainState, int]]
+    close: Callable[[], None]
+
+
+def make(config: Config, env: Environment | HostEnvironment | None = None) -> Program:
+    """The functions that train `config`, in `env` or the environments that it names.
+
+    Raises:
+      InvalidInput: environments that cannot be made, or choices that they do not allow.
+    """
+    env = env or suites.make(config)
+    try:
+        validate.check_spec(config, env.spec)
+        agent = make_agent(config, env.spec)
+        if isinstance(env, Environment):
+            return on_device(env, agent, config)
+        return on_host(env, agent, config)
+    except BaseException:
+        if not isinstance(env, Environment):
+            env.close()
+        raise
+
+
+def on_device(env: Environment, agent: Agent, config: Config) -> Program:
+    """Simulation, replay and learning in one jitted step."""
+    init = jax.jit(functools.partial(train.init, env, agent, config))
+    step = jax.jit(train.make_train_step(env, agent, config), donate_argnums=0)
+    return Program(
+        spec=env.spec,
+        agent=agent,
+        shapes=init.eval_shape(jax.random.key(0)),
+        init=lambda seed: init(jax.random.key(seed)),
+        compile=lambda state: step.lower(state).compile(),
+        episodes=lambda: None,
+        resume=lambda state, _: (state, 0),
+        close=lambda: None,
+    )
+
+
+def on_host(env: HostEnvironment, agent: Agent, config: Config) -> Program:
+    """The same update around environments on the host."""
+    spec, seed = env.spec, config.seed
+    begin = jax.jit(functools.partial(host_train.init, spec, agent, config))
+    shapes = begin.eval_shape(jax.random.key(0), host_train.first_timestep(spec))
+    images: Callable[[], PyTree] = tuple
+    if config.replay.images == "host":
+        capacity = shapes.replay.trajectory.reward.shape[1]
+        ring = {"num_envs": spec.num_envs, "capacity": capacity}
+        shapes = shapes._replace(images=image_store.specs(spec.obs, **ring))
+        images = functools.partial(image_store.init, spec.obs, **ring)
+
+    def init(seed: int) -> TrainState:
+        state = begin(jax.random.key(seed), env.reset(seed))
+        return state._replace(images=images())
+
+    def compile_step(state: TrainState) -> Step:
+        programs = host_train.compile_programs(spec, agent, config, state)
+        return host_train.make_step(env, config, programs)
+
+    def resume(state: TrainState, episodes: Arrays | None) -> tuple[TrainState, int]:
+        collector = state.collector
+        expected = jax.device_get(collector.timestep)
+        timestep, same = env.restore(seed, Episodes(**episodes or {}), expected)
+        keep = jnp.asarray(same)
+        collector = collector._replace(
+            timestep=jax.tree.map(jnp.asarray, timestep),
+            episode_return=jnp.where(keep, collector.episode_return, 0.0),
+            episode_length=jnp.where(keep, collector.episode_length, 0),
+        )
+        return state._replace(collector=collector), int((~same).sum())
+
+    return Program(
+        spec=spec,
+        agent=agent,
+        shapes=shapes,
+        init=init,
+        compile=compile_step,
+        episodes=lambda: env.episodes()._asdict(),
+        resume=resume,
+        close=env.close,
+    )
