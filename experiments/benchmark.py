@@ -1,14 +1,17 @@
 """How fast is one update? A synthetic batch, value alignment on and off in turn.
 
     python experiments/benchmark.py --size 1m --json
+    python experiments/benchmark.py --size 1m --obs pixels --json
 
 Prints medians over repeated runs after a warm-up; absolute times depend on the machine,
 ratios within one run are to be trusted. "off" drops value alignment from the compiled
-program altogether, its metrics included, so it is plain DreamerV3.
+program altogether, its metrics included, so it is plain DreamerV3. From pixels, collection is
+timed with environments that dm_control renders in 1 to 4 processes.
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import json
@@ -23,14 +26,26 @@ from typing import Literal
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from vawm import envs, flags, huge_pages, memory, train, validate
+from vawm import envs, flags, huge_pages, memory, suites, train, validate
 from vawm.agent import make_agent, parameter_count
+from vawm.collector import make_collect
 from vawm.command_line import guard
-from vawm.config import PAPER, SIZES, Config, ValueAlignmentConfig, with_size
+from vawm.config import (
+    PAPER,
+    SIZES,
+    Config,
+    ValueAlignmentConfig,
+    VisionConfig,
+    with_size,
+)
 from vawm.envs.protocol import check_positive
 from vawm.errors import InvalidInput
-from vawm.types import EnvSpec, Latent, Trajectory
+from vawm.learner import init_learner, make_update
+from vawm.objective import Batch
+from vawm.types import EnvSpec, Latent, Trajectory, image, vector
+from vawm.world_model.heads import check_image_size
 
 
 @dataclass(frozen=True)
@@ -41,8 +56,13 @@ class Benchmark:
     """model size"""
     batch_size: int = 16
     batch_length: int = 64
+    obs: Literal["vector", "pixels"] = "vector"
+    """pixels: RGB images, and 18 discrete actions as in Atari"""
     observations: int = 24
+    """width of the vector"""
     actions: int = 6
+    """continuous actions with a vector"""
+    image_size: int = 64
     repeats: int = 16
     """timed updates of each kind"""
     compute_dtype: Literal["auto", "float32", "bfloat16"] = "auto"
@@ -51,6 +71,8 @@ class Benchmark:
     num_envs: int = 16
     env_calls: int = 100
     """steps of every environment in the timed collection"""
+    fast_rendering: bool = False
+    """without shadows, reflections and anti-aliasing"""
     json: bool = False
     """print one JSON object and nothing else"""
 
@@ -59,6 +81,7 @@ def check(options: Benchmark) -> None:
     """Refuses what cannot be measured, before anything is compiled."""
     validate.check_choice("size", options.size, SIZES)
     envs.check_task(options.task)
+    check_image_size("image_size", options.image_size)
     for field in dataclasses.fields(options):
         value = getattr(options, field.name)
         if field.type == "int":
@@ -82,26 +105,42 @@ def make_config(options: Benchmark) -> Config:
     )
 
 
-def synthetic_batch(options: Benchmark, config: Config, latent: Latent) -> train.Batch:
+def synthetic_batch(options: Benchmark, config: Config, latent: Latent) -> Batch:
     shape = options.batch_size, options.batch_length + 1
     key_obs, key_action, key_reward = jax.random.split(jax.random.key(0), 3)
     flags = jnp.zeros(shape, bool)
+    spec = make_spec(options)
+    if options.obs == "pixels":
+        obs = jax.random.randint(key_obs, (*shape, *spec.obs.shape), 0, 256).astype(jnp.uint8)
+        chosen = jax.random.randint(key_action, shape, 0, spec.action_size)
+        action = jax.nn.one_hot(chosen, spec.action_size)
+    else:
+        obs = jax.random.normal(key_obs, (*shape, *spec.obs.shape))
+        action = jax.random.normal(key_action, (*shape, spec.action_size))
     trajectory = Trajectory(
-        obs=jax.random.normal(key_obs, (*shape, options.observations)),
+        obs=obs,
         reward=jax.random.uniform(key_reward, shape),
         is_first=flags,
         is_last=flags,
         is_terminal=flags,
-        action=jax.random.normal(key_action, (*shape, options.actions)),
+        action=action,
     )
-    return train.Batch(trajectory, latent)
+    return Batch(trajectory, latent)
+
+
+def make_spec(options: Benchmark) -> EnvSpec:
+    """What a synthetic batch is from."""
+    if options.obs == "pixels":
+        return EnvSpec("synthetic", image(options.image_size), 18, True, 1, 1, None)
+    obs = vector(options.observations)
+    return EnvSpec("synthetic", obs, options.actions, False, 1, 1, None)
 
 
 class TimedUpdate:
     """One compiled variant of the update and the learner that it advances."""
 
-    def __init__(self, agent, config: Config, batch: train.Batch, aligned: bool):
-        update = train.make_update(agent, config)
+    def __init__(self, agent, config: Config, batch: Batch, aligned: bool):
+        update = make_update(agent, config)
 
         def step(learner, batch, key):
             learner, latent, metrics = update(learner, batch, key, jnp.ones((), jnp.int32))
@@ -110,7 +149,7 @@ class TimedUpdate:
 
         self.batch, self.key = batch, jax.random.key(1)
         self.seconds: list[float] = []
-        init = jax.jit(lambda key: train.init_learner(agent, config, key))
+        init = jax.jit(lambda key: init_learner(agent, config, key))
         self.learner = init(jax.random.key(0))
         begin = time.perf_counter()
         self.step = (
@@ -130,7 +169,7 @@ def env_steps_per_s(options: Benchmark, config: Config) -> float:
     env = envs.make(options.task, num_envs=options.num_envs, action_repeat=1)
     agent = make_agent(config, env.spec)
     state = train.init(env, agent, config, jax.random.key(0))
-    collect = jax.jit(train.make_collect(env, agent, config))
+    collect = jax.jit(make_collect(env, agent, config))
     seconds = []
     for _ in range(4):
         begin = time.perf_counter()
@@ -141,12 +180,37 @@ def env_steps_per_s(options: Benchmark, config: Config) -> float:
     return options.num_envs * options.env_calls / statistics.median(seconds[1:])
 
 
+def frames_per_s(options: Benchmark, config: Config) -> dict[str, float]:
+    """Rendered steps a second of all environments together, acted on, by worker processes."""
+    choices = VisionConfig(image_size=options.image_size, fast_rendering=options.fast_rendering)
+    config = dataclasses.replace(config, suite="dmc_vision", task=options.task)
+    act, measured = None, {}
+    for workers in (1, 2, 3, 4):
+        many = dataclasses.replace(choices, workers=workers)
+        with contextlib.closing(suites.on_host(config, many)) as environments:
+            timestep = environments.reset(0)
+            agent = make_agent(config, environments.spec)
+            params, carry = agent.init(jax.random.key(0)), agent.initial(options.num_envs)
+            act = act or jax.jit(agent.act)
+            seconds = []
+            for _ in range(options.env_calls + 2):
+                begin = time.perf_counter()
+                carry, action = act(params, jax.random.key(0), carry, timestep)
+                environments.send(np.asarray(action))
+                timestep = environments.receive()
+                seconds.append(time.perf_counter() - begin)
+        measured[str(workers)] = options.num_envs / statistics.median(seconds[2:])
+    return measured
+
+
 def check_memory(agent, config: Config) -> None:
     """Refuses what does not fit: two learners, and the larger part of one update."""
-    init = functools.partial(train.init_learner, agent, config)
+    init = functools.partial(init_learner, agent, config)
     learner = jax.eval_shape(init, jax.random.key(0))
     state, params = memory.nbytes(learner), memory.nbytes(learner.params)
-    needed = 2 * (state + params) + memory.working_bytes(config) + memory.process_bytes()
+    needed = (
+        2 * (state + params) + memory.working_bytes(agent.spec, config) + memory.process_bytes()
+    )
     available = memory.available_bytes()
     if available is not None and needed > available:
         remedy = (
@@ -166,10 +230,7 @@ def quartiles(values: Sequence[float]) -> list[float]:
 
 def run(options: Benchmark) -> dict:
     config = make_config(options)
-    spec = EnvSpec(
-        "synthetic", (options.observations,), "float32", options.actions, False, 1, 1, None
-    )
-    agent = make_agent(config, spec)
+    agent = make_agent(config, make_spec(options))
     check_memory(agent, config)
     batch = synthetic_batch(options, config, agent.world_model.initial(options.batch_size))
     plain = dataclasses.replace(
@@ -187,8 +248,15 @@ def run(options: Benchmark) -> dict:
         on.run()
         off.run()
     overheads = [100 * (a / b - 1) for a, b in zip(on.seconds, off.seconds, strict=True)]
+    if options.obs == "pixels":
+        collected: dict = {"frames_per_s_by_workers": frames_per_s(options, config)}
+        collected["fast_rendering"] = options.fast_rendering
+    else:
+        collected = {"env_steps_per_s": env_steps_per_s(options, config)}
     return {
         "size": options.size,
+        "obs": options.obs,
+        "image_size": options.image_size if options.obs == "pixels" else None,
         "params": parameter_count(on.learner.params),
         "device": jax.devices()[0].device_kind,
         "cores": os.cpu_count(),
@@ -202,7 +270,7 @@ def run(options: Benchmark) -> dict:
         "overhead_percent_quartiles": quartiles(overheads),
         "compile_s": on.compile_seconds,
         "peak_rss_gb": peak_rss_gb,
-        "env_steps_per_s": env_steps_per_s(options, config),
+        **collected,
         "env_task": options.task,
         "num_envs": options.num_envs,
     }

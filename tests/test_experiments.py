@@ -76,7 +76,7 @@ class FakeUpdate:
     compile_seconds = 5.0
 
     def __init__(self, agent, config, batch, aligned):
-        self.learner = benchmark.train.init_learner(agent, config, benchmark.jax.random.key(0))
+        self.learner = benchmark.init_learner(agent, config, benchmark.jax.random.key(0))
         self.factor, self.seconds = 1 + aligned, []
 
     def run(self):

@@ -1,0 +1,26 @@
+"""Value-aligned DreamerV3 on any registered Gymnasium environment.
+
+    python experiments/gymnasium_task.py --task CartPole-v1
+
+The environment is checked first; all that does not fit is told at once. One that is not
+registered is trained by `vawm.runner.run(config, logdir, env=vawm.envs.from_gymnasium(...))`.
+Every field of `vawm.config.Config` is a flag, those of `GymnasiumConfig` as `--env.*`;
+`--help` lists them.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+from vawm import command_line, huge_pages
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Trains one agent; returns the exit code."""
+    return command_line.train(argv, suite="gymnasium", description=__doc__)
+
+
+if __name__ == "__main__":
+    huge_pages.use_huge_pages()
+    sys.exit(command_line.guard(main))
