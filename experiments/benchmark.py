@@ -33,7 +33,6 @@ from vawm.agent import make_agent, parameter_count
 from vawm.collector import make_collect
 from vawm.command_line import guard
 from vawm.config import (
-    PAPER,
     SIZES,
     Config,
     ValueAlignmentConfig,
@@ -44,6 +43,7 @@ from vawm.envs.protocol import check_positive
 from vawm.errors import InvalidInput
 from vawm.learner import init_learner, make_update
 from vawm.objective import Batch
+from vawm.presets import PAPER
 from vawm.types import EnvSpec, Latent, Trajectory, image, vector
 from vawm.world_model.heads import check_image_size
 

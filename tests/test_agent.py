@@ -7,7 +7,8 @@ import pytest
 import tiny
 
 from vawm.agent import make_agent, parameter_count, resolve_dtype
-from vawm.config import PAPER, with_size
+from vawm.config import with_size
+from vawm.presets import PAPER
 from vawm.types import EnvSpec, TimeStep, image, vector
 
 # The official DreamerV3's counts for 24 observations and 6 continuous actions.

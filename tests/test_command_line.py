@@ -8,7 +8,7 @@ import pytest
 import tiny
 import toy
 
-from vawm import cache, checkpoint, command_line, rundir, runner
+from vawm import cache, checkpoint, command_line, presets, rundir, runner
 from vawm import config as config_lib
 from vawm.errors import InvalidInput
 
@@ -54,10 +54,10 @@ def saved(tmp_path):
 
 
 def test_the_defaults_are_the_preset():
-    assert parse().config == config_lib.QUICK
-    assert parse("--preset", "paper").config == config_lib.PAPER
+    assert parse().config == presets.QUICK
+    assert parse("--preset", "paper").config == presets.PAPER
     assert parse("--preset=paper", "--size=25m").config == config_lib.with_size(
-        config_lib.PAPER, "25m"
+        presets.PAPER, "25m"
     )
 
 
@@ -72,14 +72,14 @@ def test_other_flags_override_preset_and_size_in_any_order():
     assert config.value_alignment.weight == "off"
     assert not config.critic.replay_gradient
     assert (config.env_steps, config.seed, config.imagination.lambda_) == (5000, 3, 0.9)
-    assert config.num_envs == config_lib.QUICK.num_envs
+    assert config.num_envs == presets.QUICK.num_envs
 
 
 def test_every_field_of_the_config_is_a_flag(capsys):
     with pytest.raises(SystemExit, match="0"):
         parse("--help")
     text = capsys.readouterr().out
-    for name, _ in command_line.validate.values(config_lib.PAPER):
+    for name, _ in command_line.validate.values(presets.PAPER):
         flag = "--" + name.replace("_", "-").replace("lambda-", "lambda_")
         assert flag in text, flag
 
@@ -121,7 +121,7 @@ def test_bad_input_is_one_line_and_code_2(experiment, capsys, flags, message):
 
 
 def test_the_preset_says_what_it_is(experiment, capsys):
-    quick = config_lib.QUICK
+    quick = presets.QUICK
     assert experiment() == 0
     text = capsys.readouterr().out
     assert (
@@ -148,12 +148,12 @@ def test_value_alignment_that_is_off_is_called_off(preset):
 def test_the_warm_up_of_quick_keeps_its_share_of_another_length(flag):
     alignment = parse(*flag).config.value_alignment
     assert alignment == dataclasses.replace(
-        config_lib.QUICK.value_alignment, warmup_steps=2 * 7_200
+        presets.QUICK.value_alignment, warmup_steps=2 * 7_200
     )
     given = parse(*flag, "--value-alignment.warmup-steps", "5").config
     assert given.value_alignment.warmup_steps == 5
     paper = parse(*flag, "--preset", "paper").config
-    assert paper.value_alignment == config_lib.PAPER.value_alignment
+    assert paper.value_alignment == presets.PAPER.value_alignment
 
 
 def test_the_warm_up_of_a_saved_run_stays_when_it_is_extended(saved):
@@ -184,7 +184,7 @@ def test_the_share_of_the_run_with_value_alignment_is_told(flags, expected):
 
 
 def test_the_warm_up_of_the_paper_is_told_and_not_called_scaled():
-    text = command_line.describe(config_lib.PAPER)
+    text = command_line.describe(presets.PAPER)
     assert text.endswith("value alignment: active after 10,000 env steps, for 98 % of the run")
 
 

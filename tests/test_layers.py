@@ -11,6 +11,7 @@ PACKAGE = pathlib.Path(__file__).parents[1] / "vawm"
 LAYERS = {
     "errors": set(),
     "config": set(),
+    "presets": {"config"},
     "huge_pages": set(),
     "cache": set(),
     "types": set(),

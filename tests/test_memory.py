@@ -9,7 +9,7 @@ import pytest
 import tiny
 
 from vawm import config as config_lib
-from vawm import host_train, image_store, memory, train
+from vawm import host_train, image_store, memory, presets, train
 from vawm.agent import make_agent
 from vawm.envs import probes
 from vawm.errors import InvalidInput
@@ -95,9 +95,9 @@ def test_a_replay_too_small_to_learn_from_is_not_named():
 def pixels(monkeypatch, backend, images="device", env_steps=20_000_000):
     """Estimates for 5 million images of 64 x 64 x 3 in replay, and the config."""
     config = dataclasses.replace(
-        config_lib.VISION_PAPER,
+        presets.VISION_PAPER,
         env_steps=env_steps,
-        replay=dataclasses.replace(config_lib.VISION_PAPER.replay, images=images),
+        replay=dataclasses.replace(presets.VISION_PAPER.replay, images=images),
     )
     spec = EnvSpec("test", image(64), 6, False, config.num_envs, 2, 500)
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
@@ -158,9 +158,9 @@ def test_a_run_is_charged_for_no_more_images_than_it_collects(monkeypatch):
 
 # GiB at the peak, on a CPU with 2 cores: cartpole_swingup, and walker_walk until a few
 # dozen updates were done.
-SHORT = dataclasses.replace(config_lib.PAPER, env_steps=4_300)
+SHORT = dataclasses.replace(presets.PAPER, env_steps=4_300)
 MEASURED = [
-    (config_lib.QUICK, 2.47),
+    (presets.QUICK, 2.47),
     (SHORT, 4.28),
     (config_lib.with_size(SHORT, "25m"), 5.73),
 ]

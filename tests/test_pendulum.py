@@ -10,7 +10,7 @@ import pytest
 import runs
 import tiny
 
-from vawm import checkpoint, config, envs, evaluate, runner
+from vawm import checkpoint, envs, evaluate, presets, runner
 
 CONFIG = tiny.config(
     task="pendulum_swingup", action_repeat=20, env_steps=3000, log_every=320, save_every=960
@@ -90,7 +90,7 @@ def test_the_readme_makes_environments():
 
 
 def test_the_readme_stacks_seeds(monkeypatch):
-    monkeypatch.setattr(config, "QUICK", tiny.CONFIG)
+    monkeypatch.setattr(presets, "QUICK", tiny.CONFIG)
     monkeypatch.setattr(envs, "make", lambda *_, **__: tiny.env())
     names = {}
     with jax.debug_key_reuse(False):  # it takes a slice of a batch of keys for all of them

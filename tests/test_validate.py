@@ -7,7 +7,7 @@ import pytest
 import tiny
 
 from vawm import config as config_lib
-from vawm import validate
+from vawm import presets, validate
 from vawm.errors import InvalidInput
 from vawm.types import image
 
@@ -27,7 +27,7 @@ def changed(name, value, config=tiny.CONFIG):
     return dataclasses.replace(config, **{head: value})
 
 
-PRESETS = [(suite, name) for suite, presets in config_lib.PRESETS.items() for name in presets]
+PRESETS = [(suite, name) for suite, own in presets.PRESETS.items() for name in own]
 
 
 @pytest.mark.parametrize(("suite", "preset"), PRESETS)
@@ -53,7 +53,7 @@ def assert_refused(config, name, value):
 
 
 def quick(suite):
-    return config_lib.PRESETS[suite]["quick"]
+    return presets.PRESETS[suite]["quick"]
 
 
 @pytest.mark.parametrize("suite", config_lib.ENV_CONFIGS)
@@ -65,7 +65,7 @@ def test_every_number_of_an_environment_is_checked(suite):
 
 
 def test_every_rule_is_about_a_field():
-    names = set().union(*(numbers(quick(suite)) for suite in config_lib.PRESETS))
+    names = set().union(*(numbers(quick(suite)) for suite in presets.PRESETS))
     assert set(validate.RULES) <= names
 
 
@@ -121,7 +121,7 @@ def test_the_smallest_value_that_is_named_is_accepted(name, value):
 
 @pytest.mark.parametrize(("suite", "preset"), PRESETS)
 def test_a_batch_larger_than_replay_is_blamed_and_a_smaller_one_named(suite, preset):
-    config = config_lib.PRESETS[suite][preset]
+    config = presets.PRESETS[suite][preset]
     with pytest.raises(InvalidInput, match="does not fit into") as error:
         validate.check(changed("replay.batch_size", 100_000, config))
     assert error.value.field == "replay.batch_size"
@@ -134,7 +134,7 @@ def test_a_batch_larger_than_replay_is_blamed_and_a_smaller_one_named(suite, pre
     assert error.value.field == "replay.batch_length"
 
 
-QUICK = config_lib.QUICK
+QUICK = presets.QUICK
 
 
 @pytest.mark.parametrize(

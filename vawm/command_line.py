@@ -2,7 +2,7 @@
 
 `--preset` and `--size` choose the defaults, or `--resume` takes those of the saved run;
 every other flag then overrides one field of `Config`. Two fields follow from others: a new
-run of preset quick gets a warm-up for its length, and one with widths of its own is of size
+run of a small preset gets a warm-up for its length, and one with widths of its own is of size
 custom.
 """
 
@@ -18,7 +18,7 @@ from typing import Annotated, NamedTuple
 
 import tyro
 
-from vawm import cache, resume, runner, validate
+from vawm import cache, presets, resume, runner, validate
 from vawm import config as config_lib
 from vawm import flags as flags_lib
 from vawm.checkpoint import SaveError
@@ -133,22 +133,27 @@ def _defaults(argv: list[str], suite: str, preset: str) -> Config:
 
 
 def _with_its_warmup(config: Config, env_steps: str | None) -> Config:
-    """`config`; of preset quick, with the warm-up for a run of the length that was given."""
+    """`config`; of a small preset, with the warm-up for a run of the length that was given."""
     try:
         length = int(env_steps or "")
     except ValueError:  # none, or one that the second phase refuses
         return config
-    if config.preset != "quick":
+    if not is_small(config):
         return config
-    warmup = scaled_warmup(config.suite, length)
+    warmup = scaled_warmup(config, length)
     alignment = dataclasses.replace(config.value_alignment, warmup_steps=warmup)
     return dataclasses.replace(config, value_alignment=alignment)
 
 
-def scaled_warmup(suite: str, env_steps: int) -> int:
-    """The warm-up of preset quick, in env steps, for another length: the same share of it."""
-    quick = config_lib.PRESETS[suite]["quick"]
-    return quick.value_alignment.warmup_steps * env_steps // quick.env_steps
+def is_small(config: Config) -> bool:
+    """Whether this run is of a preset for a CPU: any but that of the paper."""
+    return config.preset != "paper" and config.preset in presets.PRESETS[config.suite]
+
+
+def scaled_warmup(config: Config, env_steps: int) -> int:
+    """The warm-up of a small preset, in env steps, for another length: the same share."""
+    usual = presets.PRESETS[config.suite][config.preset]
+    return usual.value_alignment.warmup_steps * env_steps // usual.env_steps
 
 
 def _with_its_size(config: Config) -> Config:
@@ -174,9 +179,9 @@ def describe(config: Config) -> str:
     )
     alignment, paper = (
         _describe_alignment(config),
-        config_lib.PRESETS[config.suite].get("paper"),
+        presets.PRESETS[config.suite].get("paper"),
     )
-    if config.preset != "quick":
+    if not is_small(config):
         return f"{head}\nvalue alignment: {alignment}"
     lines = [head, "  for a CPU with 2 cores and some minutes; this is not the paper's setting"]
     lines.append(f"  value alignment: {alignment}")
@@ -190,8 +195,8 @@ def describe(config: Config) -> str:
 
 def _describe_alignment(config: Config) -> str:
     """From when on value alignment is active, and for how much of the run."""
-    presets, alignment = config_lib.PRESETS[config.suite], config.value_alignment
-    paper = presets.get("paper", config_lib.PAPER)
+    alignment = config.value_alignment
+    paper = presets.PRESETS[config.suite].get("paper", presets.PAPER)
     if alignment.weight == "off":
         return "off"
     in_updates = alignment.warmup_unit == "updates"
@@ -205,8 +210,8 @@ def _describe_alignment(config: Config) -> str:
     percent = 100 * (length - warmup) // length
     share = f"{about}{percent} %" if percent else "less than 1 %"
     text = f"active after {warmup:,} {unit}, for {share} of the run"
-    short = config.preset == "quick" and config.env_steps < paper.env_steps
-    if short and not in_updates and warmup == scaled_warmup(config.suite, config.env_steps):
+    short = is_small(config) and config.env_steps < paper.env_steps
+    if short and not in_updates and warmup == scaled_warmup(config, config.env_steps):
         scale = f"{paper.value_alignment.warmup_steps:,} of {paper.env_steps:,}"
         text += f"; the warm-up is scaled to the short run (paper: {scale})"
     return text

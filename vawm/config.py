@@ -1,4 +1,4 @@
-"""Every choice of a run, as frozen dataclasses; presets are values of them.
+"""Every choice of a run, as frozen dataclasses; `vawm.presets` has values of them.
 
 Numbers are Table 15 of the paper unless their comment names another source. Nothing here
 imports the rest of the package. Factories read these; losses only ever receive numbers.
@@ -97,7 +97,7 @@ class ValueAlignmentConfig:
     static_weight: float = 0.5
     """used by weight="static", after the warm-up; Table 3"""
     warmup_steps: int = 10_000
-    """weight 0 up to and including this step; in preset quick it scales with --env-steps"""
+    """weight 0 up to and including this step; in small presets it scales with --env-steps"""
     warmup_unit: Literal["env_steps", "updates"] = "env_steps"
     dynamics_scale: float = 0.5
     """on KL[sg V(s) || V(s~)]"""
@@ -236,7 +236,7 @@ class Config:
     agent: Literal["dreamerv3"] = "dreamerv3"
     """which world model imagines"""
     preset: str = "paper"
-    """where the other numbers come from: an entry of `PRESETS`, or custom"""
+    """where the other numbers come from: an entry of `presets.PRESETS`, or custom"""
     size: str = "12m"
     """whose widths these are: an entry of `SIZES`, or custom"""
     seed: int = 0
@@ -265,7 +265,7 @@ class Config:
 
 
 CUSTOM = "custom"
-"""the preset or size of a run that none of `PRESETS` or `SIZES` describes"""
+"""the preset or size of a run that none of `presets.PRESETS` or `SIZES` describes"""
 
 
 @dataclass(frozen=True)
@@ -307,103 +307,6 @@ def with_size(config: Config, size: str) -> Config:
         actor=dataclasses.replace(config.actor, units=widths.units),
         critic=dataclasses.replace(config.critic, units=widths.units),
     )
-
-
-PAPER = Config()
-
-QUICK = dataclasses.replace(
-    with_size(PAPER, "1m"),
-    preset="quick",
-    env_steps=120_000,
-    num_envs=8,
-    action_repeat=4,
-    train_ratio=64,
-    log_every=2_000,
-    save_every=24_000,
-    imagination=ImaginationConfig(discount_horizon=150.0),
-    value_alignment=ValueAlignmentConfig(warmup_steps=7_200),
-    optimizer=OptimizerConfig(learning_rate=6e-4, warmup_updates=300),
-    replay=ReplayConfig(batch_size=8, batch_length=32),
-)
-"""For a CPU with 2 cores: steps in the simulation cost little there and updates much, so it
-takes few small updates at a high learning rate, and long actions."""
-
-VISION_PAPER = dataclasses.replace(
-    PAPER,
-    suite="dmc_vision",
-    task="walker_walk",
-    env_steps=1_000_000,
-    video=VideoConfig(every=50_000),
-    env=VisionConfig(),
-)
-"""DMC vision; batch, train ratio and action repeat as for the proprio tasks."""
-
-VISION_QUICK = dataclasses.replace(
-    VISION_PAPER,
-    **{
-        name: getattr(QUICK, name)
-        for name in (
-            *("preset", "size", "num_envs", "action_repeat", "train_ratio", "log_every"),
-            *("world_model", "actor", "critic", "imagination", "optimizer", "replay"),
-        )
-    },
-    task="cartpole_balance",
-    env_steps=60_000,
-    save_every=12_000,
-    value_alignment=ValueAlignmentConfig(warmup_steps=3_600),
-    video=VideoConfig(every=20_000),
-)
-
-ATARI_PAPER = dataclasses.replace(
-    PAPER,
-    suite="atari100k",
-    task="breakout",
-    env_steps=400_000,
-    num_envs=1,
-    action_repeat=4,
-    train_ratio=256,
-    save_every=40_000,
-    value_alignment=ValueAlignmentConfig(warmup_steps=40_000),
-    video=VideoConfig(every=40_000),
-    env=AtariConfig(),
-)
-"""100,000 agent steps of 4 frames each; the warm-up is 10,000 of them, since the paper's text
-calls the agent's steps training steps. The train ratio is the official code's."""
-
-ATARI_QUICK = dataclasses.replace(
-    ATARI_PAPER,
-    **{
-        name: getattr(QUICK, name)
-        for name in (
-            *("preset", "size", "log_every", "world_model", "actor", "critic"),
-            *("imagination", "optimizer", "replay"),
-        )
-    },
-    env_steps=80_000,
-    save_every=16_000,
-    train_ratio=32,
-    value_alignment=ValueAlignmentConfig(warmup_steps=8_000),
-    video=VideoConfig(every=20_000),
-)
-
-GYMNASIUM_QUICK = dataclasses.replace(
-    QUICK,
-    suite="gymnasium",
-    task="CartPole-v1",
-    action_repeat=1,
-    env_steps=30_000,
-    save_every=6_000,
-    value_alignment=ValueAlignmentConfig(warmup_steps=1_800),
-    env=GymnasiumConfig(),
-)
-
-PRESETS = {
-    "dmc_proprio": {"quick": QUICK, "paper": PAPER},
-    "dmc_vision": {"quick": VISION_QUICK, "paper": VISION_PAPER},
-    "atari100k": {"quick": ATARI_QUICK, "paper": ATARI_PAPER},
-    "gymnasium": {"quick": GYMNASIUM_QUICK},
-}
-"""Suite -> name -> config."""
 
 
 def as_dict(config: Config) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from typing import Any
 import jax
 
 from vawm import config as config_lib
+from vawm import presets
 from vawm.config import AtariConfig, Config, VisionConfig
 from vawm.envs import EPISODE_STEPS
 from vawm.errors import InvalidInput
@@ -143,8 +144,8 @@ def _check_together(config: Config) -> None:
 
 def _check_names(config: Config) -> None:
     """Preset and size are known, and a size is not the name of other widths than its own."""
-    presets = config_lib.PRESETS[config.suite]
-    check_choice("preset", config.preset, [*presets, config_lib.CUSTOM])
+    known = presets.PRESETS[config.suite]
+    check_choice("preset", config.preset, [*known, config_lib.CUSTOM])
     check_choice("size", config.size, [*config_lib.SIZES, config_lib.CUSTOM])
     if config.size == config_lib.CUSTOM:
         return
@@ -208,7 +209,7 @@ def _check_replay(config: Config) -> None:
 
 def _usual(config: Config) -> Config:
     """The preset of this run; that of the paper where it has none of its own."""
-    return config_lib.PRESETS[config.suite].get(config.preset, config_lib.PAPER)
+    return presets.PRESETS[config.suite].get(config.preset, presets.PAPER)
 
 
 def _blame_batch(config: Config) -> None:
@@ -324,10 +325,10 @@ def check_images(config: Config, *, present: bool) -> None:
 
 def preset(suite: str, name: str, size: str | None = None) -> Config:
     """The config of a preset, at another size where one is given."""
-    check_choice("suite", suite, config_lib.PRESETS)
-    presets = config_lib.PRESETS[suite]
-    check_choice("preset", name, presets)
+    check_choice("suite", suite, presets.PRESETS)
+    known = presets.PRESETS[suite]
+    check_choice("preset", name, known)
     if size is None:
-        return presets[name]
+        return known[name]
     check_choice("size", size, config_lib.SIZES)
-    return config_lib.with_size(presets[name], size)
+    return config_lib.with_size(known[name], size)

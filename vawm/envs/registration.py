@@ -6,9 +6,11 @@ import gymnasium
 
 from vawm.envs import TASKS
 
+GRID_WORLD = "vawm/GridWorld-v0"
+
 
 def register() -> None:
-    """Registers the 18 tasks, single and vectorised; a second call changes nothing.
+    """Registers the 18 tasks, single and vectorised, and the grid world; once is enough.
 
     Episodes end in the environment itself, so there is no `max_episode_steps` and no
     TimeLimit wrapper. `action_repeat` is a keyword of `gymnasium.make` and `make_vec`.
@@ -21,6 +23,10 @@ def register() -> None:
                 vector_entry_point="vawm.envs.gym:BatchedEnv",
                 kwargs={"task": task},
             )
+    if GRID_WORLD not in gymnasium.registry:
+        gymnasium.register(
+            GRID_WORLD, entry_point="vawm.envs.grid_world:GridWorld", max_episode_steps=50
+        )
 
 
 def env_id(task: str) -> str:

@@ -1,0 +1,63 @@
+"""A small world of pixels: walk to the goal, again and again.
+
+Registered with Gymnasium as "vawm/GridWorld-v0": episodes of 50 steps in a room of 5 x 5
+fields, drawn as 64 x 64 pixels. The reward is 1 for each goal that is reached, upon which the
+next appears somewhere else. Whoever walks straight reaches 15 in an episode, random steps
+reach one.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+FIELDS = 5  # a side
+FIELD = 12  # pixels a side
+SIZE = 64
+MARGIN = (SIZE - FIELDS * FIELD) // 2
+FLOOR, WALKER, GOAL = (70, 70, 70), (255, 255, 255), (0, 200, 0)
+MOVES = np.array([(-1, 0), (1, 0), (0, -1), (0, 1)])  # up, down, left, right
+
+
+class GridWorld(gymnasium.Env):
+    """Observations are `[64, 64, 3]` uint8, actions 0 to 3: up, down, left, right."""
+
+    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012 (of the base)
+
+    def __init__(self, render_mode: str | None = None):
+        self.render_mode = render_mode
+        self.observation_space = spaces.Box(0, 255, (SIZE, SIZE, 3), np.uint8)
+        self.action_space = spaces.Discrete(len(MOVES))
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
+        """Walker and goal on fields of their own."""
+        super().reset(seed=seed)
+        self.walker = self.np_random.integers(FIELDS, size=2)
+        self._move_goal()
+        return self.render(), {}
+
+    def step(self, action: int):
+        """One field; walls stop the walker."""
+        self.walker = np.clip(self.walker + MOVES[action], 0, FIELDS - 1)
+        reached = bool((self.walker == self.goal).all())
+        if reached:
+            self._move_goal()
+        return self.render(), float(reached), False, False, {}
+
+    def render(self) -> np.ndarray:  # type: ignore[override]
+        """The room from above."""
+        picture = np.zeros((SIZE, SIZE, 3), np.uint8)
+        picture[MARGIN:-MARGIN, MARGIN:-MARGIN] = FLOOR
+        for (row, column), color in ((self.goal, GOAL), (self.walker, WALKER)):
+            top, left = MARGIN + FIELD * row, MARGIN + FIELD * column
+            picture[top : top + FIELD, left : left + FIELD] = color
+        return picture
+
+    def _move_goal(self) -> None:
+        """Anywhere but where the walker is."""
+        index = self.np_random.integers(FIELDS**2 - 1)
+        here = self.walker[0] * FIELDS + self.walker[1]
+        self.goal = np.array(divmod(index + (index >= here), FIELDS))
