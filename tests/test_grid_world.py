@@ -1,0 +1,75 @@
+"""The grid world: its rules, its pixels, and Gymnasium's own opinion of it."""
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from vawm.envs import registration
+from vawm.envs.grid_world import GOAL, WALKER, GridWorld
+from vawm.envs.host import gymnasium as adapter
+
+registration.register()
+
+
+@pytest.fixture
+def world():
+    world = GridWorld()
+    world.reset(seed=0)
+    return world
+
+
+def test_it_passes_the_checkers():
+    env = gymnasium.make(registration.GRID_WORLD)
+    check_env(env.unwrapped, skip_render_check=True)
+    assert adapter.problems(gymnasium.make(registration.GRID_WORLD)) == []
+
+
+def test_an_episode_has_50_steps():
+    env = gymnasium.make(registration.GRID_WORLD)
+    env.reset(seed=0)
+    ends = [env.step(0)[2:4] for _ in range(50)]
+    assert ends == [(False, False)] * 49 + [(False, True)]
+
+
+@pytest.mark.parametrize(
+    ("action", "moved"), [(0, (-1, 0)), (1, (1, 0)), (2, (0, -1)), (3, (0, 1))]
+)
+def test_steps_move_one_field_and_walls_stop(world, action, moved):
+    world.goal = np.array([4, 4])
+    world.walker = np.array([2, 2])
+    world.step(action)
+    assert tuple(world.walker - 2) == moved
+    for _ in range(5):
+        world.step(action)
+    assert world.walker.min() >= 0
+    assert world.walker.max() <= 4
+
+
+def test_a_goal_that_is_reached_is_rewarded_once_and_moves(world):
+    world.walker, world.goal = np.array([2, 2]), np.array([2, 3])
+    picture, reward, *_ = world.step(3)
+    assert reward == 1.0
+    assert (world.goal != world.walker).any()
+    np.testing.assert_array_equal(picture, world.render())
+    rewards = [world.step(action)[1] for action in (0, 0, 0, 0)]
+    assert sum(rewards) <= 1
+
+
+def test_the_goal_appears_on_every_other_field(world):
+    world.walker = np.array([1, 3])
+    seen = set()
+    for _ in range(500):
+        world._move_goal()
+        seen.add(tuple(world.goal.tolist()))
+    assert seen == {(i, j) for i in range(5) for j in range(5)} - {(1, 3)}
+
+
+def test_walker_and_goal_are_drawn_where_they_are(world):
+    world.walker, world.goal = np.array([0, 0]), np.array([4, 2])
+    picture = world.render()
+    assert picture.shape == (64, 64, 3)
+    assert (picture[2:14, 2:14] == WALKER).all()
+    assert (picture[50:62, 26:38] == GOAL).all()
+    assert (picture == GOAL).all(-1).sum() == (picture == WALKER).all(-1).sum() == 144
+    assert (picture[[0, 1, -1, -2]] == 0).all()
