@@ -1,5 +1,7 @@
 """Parameter counts of the official code, and acting."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +10,8 @@ import tiny
 
 from vawm.agent import make_agent, parameter_count, resolve_dtype
 from vawm.config import with_size
+from vawm.envs import probes
+from vawm.errors import InvalidInput
 from vawm.presets import PAPER
 from vawm.types import EnvSpec, TimeStep, image, vector
 
@@ -127,3 +131,41 @@ def test_the_compute_dtype_follows_the_device_unless_asked_otherwise(
     assert resolve_dtype("auto") == auto
     assert resolve_dtype("bfloat16") == jnp.bfloat16
     assert resolve_dtype("float32") == jnp.float32
+
+
+def discrete_agent(temperature=1.0):
+    actor = dataclasses.replace(tiny.CONFIG.actor, collect_temperature=temperature)
+    config = tiny.config(actor=actor)
+    return make_agent(config, probes.make("memory_discrete", num_envs=256).spec)
+
+
+def choices(agent, how, seed=1):
+    """Actions of 256 environments that look all the same."""
+    params = agent.init(jax.random.key(0))
+    logits = params.actor["heads_0"]["bias"]
+    params.actor["heads_0"]["bias"] = jnp.array([0.0, 1.0]).astype(logits.dtype)
+    no = jnp.zeros(256, bool)
+    timestep = TimeStep(jnp.zeros((256, 2)), jnp.zeros(256), ~no, no, no)
+    _, action = agent.act(params, jax.random.key(seed), agent.initial(256), timestep, how=how)
+    return np.asarray(action)
+
+
+def test_a_low_temperature_commits_the_policy_only_while_it_collects():
+    """Logits 0 and 1: 73 % for the second, nearly all of it at a temperature of 0.01."""
+    cold = discrete_agent(temperature=0.01)
+    assert choices(cold, "collect")[:, 1].mean() > 0.97  # 1 % is uniform
+    assert 0.6 < choices(cold, "sample")[:, 1].mean() < 0.85
+    usual = discrete_agent()
+    np.testing.assert_array_equal(choices(usual, "collect"), choices(usual, "sample"))
+
+
+def test_a_mode_is_the_same_for_every_key():
+    agent = discrete_agent()
+    np.testing.assert_array_equal(choices(agent, "mode"), choices(agent, "mode", seed=2))
+    assert (choices(agent, "mode")[:, 1] == 1).all()
+
+
+def test_a_temperature_of_continuous_actions_is_refused():
+    actor = dataclasses.replace(tiny.CONFIG.actor, collect_temperature=0.5)
+    with pytest.raises(InvalidInput, match=r"actor.collect_temperature=0.5: use 1"):
+        make_agent(tiny.config(actor=actor), spec())

@@ -2,9 +2,11 @@
 
 import errno
 import shutil
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 import tiny
 import toy
@@ -15,7 +17,7 @@ from vawm.errors import InvalidInput
 PROGRESS = {"env_steps": 8, "seconds": 1 / 3}
 
 
-def save(logdir, state, env_steps=8):
+def save(logdir, state, env_steps=8, **changes):
     return checkpoint.save(
         logdir,
         state,
@@ -23,6 +25,7 @@ def save(logdir, state, env_steps=8):
         config=tiny.CONFIG,
         spec=toy.SPEC,
         progress=PROGRESS,
+        **changes,
     )
 
 
@@ -39,6 +42,61 @@ def test_everything_comes_back_bit_for_bit(tmp_path):
     assert saved.spec == toy.SPEC
     assert saved.progress == PROGRESS
     assert saved.env_steps == 8
+
+
+class Host(NamedTuple):
+    """A state with images in host memory."""
+
+    learner: Any
+    images: Any
+    key: Any
+
+
+def with_images():
+    state = toy.state()
+    pictures = np.arange(2 * 3 * 4, dtype=np.uint8).reshape(2, 3, 4)
+    images = {"picture": pictures, "state": np.zeros((2, 0), np.float32)}
+    return Host(state.learner, images, state.key)
+
+
+EPISODES = {
+    "index": np.array([3, 2**40]),
+    "length": np.array([2, 0]),
+    "actions": np.array([[0.5], [-1.0]], np.float32),
+}
+
+
+def test_images_and_episodes_of_the_host_come_back_as_numpy(tmp_path):
+    state = with_images()
+    save(tmp_path, state, episodes=EPISODES)
+    restored, _ = checkpoint.restore(tmp_path, state)
+    for name, images in state.images.items():
+        assert isinstance(restored.images[name], np.ndarray)
+        assert restored.images[name].dtype == images.dtype
+        np.testing.assert_array_equal(restored.images[name], images)
+    assert isinstance(restored.key, jax.Array)
+    episodes = checkpoint.restore_episodes(tmp_path)
+    assert episodes.keys() == EPISODES.keys()
+    for name, array in EPISODES.items():
+        assert episodes[name].dtype == array.dtype
+        np.testing.assert_array_equal(episodes[name], array)
+
+
+def test_a_state_without_environments_on_the_host_has_no_episodes(tmp_path):
+    save(tmp_path, toy.state())
+    assert checkpoint.restore_episodes(tmp_path) is None
+
+
+@pytest.mark.parametrize("item", ["images", "episodes"])
+def test_damage_to_what_the_host_keeps_is_noticed(tmp_path, item):
+    state = with_images()
+    path = save(tmp_path, state, episodes=EPISODES)
+    largest = max(files_of(path / item), key=lambda file: file.stat().st_size)
+    data = bytearray(largest.read_bytes())
+    data[len(data) // 2] ^= 1
+    largest.write_bytes(bytes(data))
+    with pytest.raises(InvalidInput, match="does not match its checksum"):
+        checkpoint.restore(tmp_path, state), checkpoint.restore_episodes(tmp_path)
 
 
 def test_parameters_are_read_without_the_rest(tmp_path):

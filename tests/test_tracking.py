@@ -14,6 +14,7 @@ from tensorboardX.record_writer import RecordWriter
 
 from vawm import tracking
 from vawm.tracking import Interval
+from vawm.video import Video
 
 
 def chunk(updates, loss, *, episodes=0, returns=0.0):
@@ -123,3 +124,38 @@ def test_a_full_disk_is_an_error_of_the_line_that_meets_it(tmp_path, monkeypatch
         tracker.write(closed(add_all(chunk(1, 2.0))))
     assert error.value.errno == errno.ENOSPC
     assert threading.active_count() == threads
+
+
+def film(name="episode", **numbers):
+    return Video(name, np.zeros((3, 16, 24, 3), np.uint8), numbers)
+
+
+def test_videos_are_files_lines_and_events(tmp_path):
+    with tracking.Tracker(tmp_path) as tracker:
+        tracker.write_videos([film(**{"return": 3.0})], env_steps=40)
+        tracker.write_videos([film("open_loop", error=[0.5, None])], env_steps=80)
+    names = ["episode-000000000040.gif", "open_loop-000000000080.gif"]
+    assert sorted(path.name for path in (tmp_path / "videos").iterdir()) == names
+    assert tracking.read(tmp_path / "videos.jsonl") == [
+        {"env_steps": 40, "video": names[0], "return": 3.0},
+        {"env_steps": 80, "video": names[1], "error": [0.5, None]},
+    ]
+    shown = [(e.step, v) for e in events(tmp_path) for v in e.summary.value]
+    assert [(step, v.tag) for step, v in shown] == [
+        (40, "video/episode"),
+        (80, "video/open_loop"),
+    ]
+    image = shown[0][1].image
+    assert (image.height, image.width, image.colorspace) == (16, 24, 3)
+    assert image.encoded_image_string == (tmp_path / "videos" / names[0]).read_bytes()
+
+
+def test_a_video_that_cannot_be_written_leaves_no_half(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(pathlib.Path, "replace", full)
+    with tracking.Tracker(tmp_path) as tracker, pytest.raises(OSError, match="No space left"):
+        tracker.write_videos([film()], env_steps=40)
+    assert not list(tmp_path.glob("videos/*"))
+    assert not (tmp_path / "videos.jsonl").exists()

@@ -200,8 +200,12 @@ class Tracker:
             folder.mkdir(exist_ok=True)
             gif, path = as_gif(video.frames), folder / f"{video.name}-{env_steps:012d}.gif"
             scratch = path.with_suffix(".gif.tmp")
-            scratch.write_bytes(gif)
-            scratch.replace(path)
+            try:
+                scratch.write_bytes(gif)
+                scratch.replace(path)
+            except OSError:
+                scratch.unlink(missing_ok=True)
+                raise
             self._board.write_video(f"video/{video.name}", gif, video.frames.shape, env_steps)
             entry = {"env_steps": env_steps, "video": path.name} | video.numbers
             with (self._logdir / VIDEO_LINES).open("a") as file:
