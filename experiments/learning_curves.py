@@ -1,10 +1,11 @@
-"""Learning curves of `dmc_proprio.py`: tasks x seeds, with and without value alignment.
+"""Learning curves of an experiment: tasks x seeds, with and without value alignment.
 
     python experiments/learning_curves.py --jobs 2
+    python experiments/learning_curves.py --experiment gymnasium_task --preset pixels
 
-Runs what is missing under `--runs`, `--jobs` at a time (on Linux each on cores of its own), and
-writes `curves.csv` and `curves.png` to `--results`. Interrupted runs are resumed, finished
-ones left alone.
+Runs what is missing under `--runs`, `--jobs` at a time (on Linux each on cores of its own),
+and writes `curves_<experiment>.csv` and `.png` to `--results`. Interrupted runs are resumed,
+finished ones left alone.
 """
 
 from __future__ import annotations
@@ -20,13 +21,27 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal, NamedTuple
 
-from vawm import checkpoint, command_line, envs, flags, rundir, tracking, validate
+from vawm import checkpoint, command_line, flags, rundir, suites, tracking, validate
 from vawm.envs.protocol import check_positive
 from vawm.errors import InvalidInput
 from vawm.runner import RunError
 
-EXPERIMENT = pathlib.Path(__file__).with_name("dmc_proprio.py")
+
+class Experiment(NamedTuple):
+    """A program beside this one: its suite, and the tasks whose curves are usually wanted."""
+
+    suite: str
+    tasks: tuple[str, ...]
+
+
+EXPERIMENTS = {
+    "dmc_proprio": Experiment("dmc_proprio", ("cartpole_swingup", "cartpole_balance")),
+    "dmc_vision": Experiment("dmc_vision", ("cartpole_balance",)),
+    "atari100k": Experiment("atari100k", ("breakout",)),
+    "gymnasium_task": Experiment("gymnasium", ("vawm/GridWorld-v0",)),
+}
 RESULTS = pathlib.Path(__file__).with_name("results")
 COLUMNS = ("task", "alignment", "seed", "env_steps", "updates", "minutes", "return")
 
@@ -35,7 +50,12 @@ COLUMNS = ("task", "alignment", "seed", "env_steps", "updates", "minutes", "retu
 class Options:
     """Which runs, and where they go."""
 
-    tasks: tuple[str, ...] = ("cartpole_swingup", "cartpole_balance")
+    experiment: Literal["dmc_proprio", "dmc_vision", "atari100k", "gymnasium_task"] = (
+        "dmc_proprio"
+    )
+    """the program that trains"""
+    tasks: tuple[str, ...] = ()
+    """as many as are named; the usual ones of the experiment if none"""
     seeds: tuple[int, ...] = (0, 1, 2)
     alignments: tuple[str, ...] = ("adaptive", "off")
     """values of --value-alignment.weight"""
@@ -49,6 +69,18 @@ class Options:
     collect_only: bool = False
     """write the results of the runs that are there, and start none"""
 
+    @property
+    def chosen_tasks(self) -> tuple[str, ...]:
+        return self.tasks or EXPERIMENTS[self.experiment].tasks
+
+    @property
+    def suite(self) -> str:
+        return EXPERIMENTS[self.experiment].suite
+
+    def result(self, ending: str) -> pathlib.Path:
+        """Where a file of results goes."""
+        return self.results / f"curves_{self.experiment}.{ending}"
+
 
 @dataclass(frozen=True)
 class Run:
@@ -57,7 +89,8 @@ class Run:
     seed: int
 
     def folder(self, options: Options) -> pathlib.Path:
-        return options.runs / f"{self.task}-{self.alignment}-seed{self.seed}"
+        name = f"{self.task.replace('/', '-')}-{self.alignment}-seed{self.seed}"
+        return options.runs / options.experiment / name
 
     def command(self, options: Options) -> list[str]:
         folder = self.folder(options)
@@ -71,7 +104,8 @@ class Run:
         if options.env_steps is not None:
             arguments["--env-steps"] = str(options.env_steps)
         resume = [] if rundir.read_config(folder) is None else ["--resume"]
-        return [sys.executable, str(EXPERIMENT), *itertools.chain(*arguments.items()), *resume]
+        program = pathlib.Path(__file__).with_name(f"{options.experiment}.py")
+        return [sys.executable, str(program), *itertools.chain(*arguments.items()), *resume]
 
     def finished(self, options: Options) -> bool:
         """Whether the newest checkpoint is at the end already."""
@@ -84,7 +118,7 @@ class Run:
 
 def all_runs(options: Options) -> list[Run]:
     """Seeds outermost, so that an early stop leaves whole comparisons."""
-    product = itertools.product(options.seeds, options.alignments, options.tasks)
+    product = itertools.product(options.seeds, options.alignments, options.chosen_tasks)
     return [Run(task, alignment, seed) for seed, alignment, task in product]
 
 
@@ -95,7 +129,7 @@ def check(options: Options) -> None:
       InvalidInput: names the option, its value and the remedy.
       RunError: a package is missing.
     """
-    config = validate.preset("dmc_proprio", options.preset)
+    config = validate.preset(options.suite, options.preset)
     if options.env_steps is not None:
         config = dataclasses.replace(config, env_steps=options.env_steps)
     for seed in options.seeds:
@@ -103,10 +137,10 @@ def check(options: Options) -> None:
     weights = flags.choices(type(config.value_alignment), "weight")
     for weight in options.alignments:
         validate.check_choice("alignments", weight, weights)
-    for task in options.tasks:
-        envs.check_task(task)
-    for name in ("tasks", "seeds", "alignments"):
-        values = getattr(options, name)
+    for task in options.chosen_tasks:
+        suites.check_task(dataclasses.replace(config, task=task))
+    chosen = {"tasks": options.chosen_tasks, "seeds": options.seeds}
+    for name, values in (chosen | {"alignments": options.alignments}).items():
         if not values or len(set(values)) < len(values):
             raise InvalidInput(name, values, "use at least one, and each once")
     check_positive("jobs", options.jobs)
@@ -184,9 +218,12 @@ def plot(rows: list[dict], options: Options, path: pathlib.Path) -> None:
     import matplotlib.pyplot as plt
 
     figure, panels = plt.subplots(
-        1, len(options.tasks), figsize=(4.5 * len(options.tasks), 3.2), squeeze=False
+        1,
+        len(options.chosen_tasks),
+        figsize=(4.5 * len(options.chosen_tasks), 3.2),
+        squeeze=False,
     )
-    for panel, task in zip(panels[0], options.tasks, strict=True):
+    for panel, task in zip(panels[0], options.chosen_tasks, strict=True):
         for color, alignment in enumerate(options.alignments):
             for seed in options.seeds:
                 run = Run(task, alignment, seed)
@@ -197,9 +234,9 @@ def plot(rows: list[dict], options: Options, path: pathlib.Path) -> None:
                     color=f"C{color}",
                     label=f"value alignment {alignment}" if seed == options.seeds[0] else None,
                 )
-        panel.set(
-            title=task, xlabel="thousand environment steps", ylabel="return", ylim=(0, 1000)
-        )
+        panel.set(title=task, xlabel="thousand environment steps", ylabel="return")
+        if options.suite.startswith("dmc"):
+            panel.set_ylim(0, 1000)
     panels[0][0].legend()
     figure.tight_layout()
     figure.savefig(path, dpi=110)
@@ -228,8 +265,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     failed = {} if options.collect_only else train(options)
     rows = read(options)
     options.results.mkdir(parents=True, exist_ok=True)
-    write_csv(rows, options.results / "curves.csv")
-    plot(rows, options, options.results / "curves.png")
+    write_csv(rows, options.result("csv"))
+    plot(rows, options, options.result("png"))
     print(summary(rows, options))
     for run, code in failed.items():
         log = run.folder(options).with_suffix(".log")

@@ -168,8 +168,8 @@ def test_a_run_that_failed_is_named_and_half_a_line_survived(options, monkeypatc
     assert "last   12.3" in output.out
     assert "exit code 137" in output.err
     assert "seed=0" in output.err
-    assert (options.results / "curves.csv").read_text().count("\n") == 2
-    assert (options.results / "curves.png").stat().st_size
+    assert (options.result("csv")).read_text().count("\n") == 2
+    assert (options.result("png")).stat().st_size
 
 
 def test_a_missing_matplotlib_is_told_before_anything_is_trained(options, monkeypatch, capsys):
