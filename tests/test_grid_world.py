@@ -35,15 +35,15 @@ def test_an_episode_has_50_steps():
 @pytest.mark.parametrize(
     ("action", "moved"), [(0, (-1, 0)), (1, (1, 0)), (2, (0, -1)), (3, (0, 1))]
 )
-def test_steps_move_one_field_and_walls_stop(world, action, moved):
-    world.goal = np.array([4, 4])
-    world.walker = np.array([2, 2])
+def test_steps_move_one_field_and_edges_stop(world, action, moved):
+    world.goal = np.array([3, 3])
+    world.walker = np.array([1, 1])
     world.step(action)
-    assert tuple(world.walker - 2) == moved
+    assert tuple(world.walker - 1) == moved
     for _ in range(5):
         world.step(action)
     assert world.walker.min() >= 0
-    assert world.walker.max() <= 4
+    assert world.walker.max() <= 3
 
 
 def test_a_goal_that_is_reached_is_rewarded_once_and_moves(world):
@@ -62,14 +62,14 @@ def test_the_goal_appears_on_every_other_field(world):
     for _ in range(500):
         world._move_goal()
         seen.add(tuple(world.goal.tolist()))
-    assert seen == {(i, j) for i in range(5) for j in range(5)} - {(1, 3)}
+    assert seen == {(i, j) for i in range(4) for j in range(4)} - {(1, 3)}
 
 
 def test_walker_and_goal_are_drawn_where_they_are(world):
-    world.walker, world.goal = np.array([0, 0]), np.array([4, 2])
+    world.walker, world.goal = np.array([0, 0]), np.array([3, 2])
     picture = world.render()
     assert picture.shape == (64, 64, 3)
-    assert (picture[2:14, 2:14] == WALKER).all()
-    assert (picture[50:62, 26:38] == GOAL).all()
-    assert (picture == GOAL).all(-1).sum() == (picture == WALKER).all(-1).sum() == 144
-    assert (picture[[0, 1, -1, -2]] == 0).all()
+    assert (picture[:16, :16] == WALKER).all()
+    assert (picture[48:, 32:48] == GOAL).all()
+    assert (picture == GOAL).all(-1).sum() == (picture == WALKER).all(-1).sum() == 256
+    assert picture.any(-1).sum() == 512

@@ -1,9 +1,8 @@
 """A small world of pixels: walk to the goal, again and again.
 
-Registered with Gymnasium as "vawm/GridWorld-v0": episodes of 50 steps in a room of 5 x 5
-fields, drawn as 64 x 64 pixels. The reward is 1 for each goal that is reached, upon which the
-next appears somewhere else. Whoever walks straight reaches 15 in an episode, random steps
-reach one.
+Registered with Gymnasium as "vawm/GridWorld-v0": episodes of 50 steps on 4 x 4 fields, drawn as
+64 x 64 pixels. The reward is 1 for each goal that is reached, upon which the next appears
+somewhere else. Whoever walks straight reaches 18 in an episode, random steps reach 1.6.
 """
 
 from __future__ import annotations
@@ -14,11 +13,10 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-FIELDS = 5  # a side
-FIELD = 12  # pixels a side
-SIZE = 64
-MARGIN = (SIZE - FIELDS * FIELD) // 2
-FLOOR, WALKER, GOAL = (70, 70, 70), (255, 255, 255), (0, 200, 0)
+FIELDS = 4  # a side
+FIELD = 16  # pixels a side
+SIZE = FIELDS * FIELD
+WALKER, GOAL = (255, 255, 255), (0, 255, 0)
 MOVES = np.array([(-1, 0), (1, 0), (0, -1), (0, 1)])  # up, down, left, right
 
 
@@ -40,7 +38,7 @@ class GridWorld(gymnasium.Env):
         return self.render(), {}
 
     def step(self, action: int):
-        """One field; walls stop the walker."""
+        """One field; the edge stops the walker."""
         self.walker = np.clip(self.walker + MOVES[action], 0, FIELDS - 1)
         reached = bool((self.walker == self.goal).all())
         if reached:
@@ -48,11 +46,10 @@ class GridWorld(gymnasium.Env):
         return self.render(), float(reached), False, False, {}
 
     def render(self) -> np.ndarray:  # type: ignore[override]
-        """The room from above."""
+        """The fields from above."""
         picture = np.zeros((SIZE, SIZE, 3), np.uint8)
-        picture[MARGIN:-MARGIN, MARGIN:-MARGIN] = FLOOR
         for (row, column), color in ((self.goal, GOAL), (self.walker, WALKER)):
-            top, left = MARGIN + FIELD * row, MARGIN + FIELD * column
+            top, left = FIELD * row, FIELD * column
             picture[top : top + FIELD, left : left + FIELD] = color
         return picture
 
