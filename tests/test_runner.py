@@ -183,6 +183,7 @@ def test_a_signal_in_the_last_chunk_does_not_unfinish_a_run(tmp_path, fake):
     assert run(tiny.CONFIG, tmp_path, console=console).exit_code == 130
     text = console.file.getvalue()
     assert "finished at 96 env steps" in text
+    assert f"vawm.load({str(tmp_path)!r})" in text  # the environment is no registered one
     assert "go on with: the same command --resume" in text
     assert "resume with" not in text
 

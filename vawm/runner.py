@@ -115,7 +115,7 @@ def run(
             rundir.write_config(logdir, config)
             state, progress = program.init(config.seed), Progress()
         result = _loop(config, logdir, program, state, progress, console)
-    _summarise(config, result, say, command)
+    _summarise(config, result, say, command, known_task=env is None)
     return result
 
 
@@ -311,7 +311,12 @@ def _explained(logdir: pathlib.Path):
 
 
 def _summarise(
-    config: Config, result: Result, say: Callable[[str], None], command: str
+    config: Config,
+    result: Result,
+    say: Callable[[str], None],
+    command: str,
+    *,
+    known_task: bool,
 ) -> None:
     lines = tracking.read(result.logdir / "metrics.jsonl")
     returns = [e["episode/return"] for e in lines if e.get("episode/return") is not None]
@@ -324,7 +329,11 @@ def _summarise(
         f"metrics, TensorBoard events and {saved}: {result.logdir}",
     ]
     if finished:
-        text.append(f"evaluate with: python -m vawm.evaluate --logdir {result.logdir}")
+        evaluation = f"python -m vawm.evaluate --logdir {result.logdir}"
+        if not known_task:
+            policy = f"vawm.load({str(result.logdir)!r})"
+            evaluation = f"vawm.evaluate.evaluate({policy}, episodes=..., env=...)"
+        text.append(f"evaluate with: {evaluation}")
         longer = f"--env-steps {2 * config.env_steps}"
         text.append(f"go on with: {command} --resume --logdir {result.logdir} {longer}")
     else:
