@@ -9,8 +9,10 @@ import jax.numpy as jnp
 import pytest
 import runs
 import tiny
+from gymnasium.envs.classic_control import CartPoleEnv
 
 from vawm import checkpoint, envs, evaluate, presets, runner
+from vawm import config as config_lib
 
 CONFIG = tiny.config(
     task="pendulum_swingup", action_repeat=20, env_steps=3000, log_every=320, save_every=960
@@ -98,5 +100,13 @@ def test_the_readme_stacks_seeds(monkeypatch):
     assert names["metrics"]["env_steps"].tolist() == [8] * 8
 
 
+def test_the_readme_trains_in_an_environment_of_ones_own(tmp_path, monkeypatch):
+    settings = {"suite": "gymnasium", "env": config_lib.GymnasiumConfig(workers=1)}
+    monkeypatch.setattr(presets, "GYMNASIUM_QUICK", tiny.config(**settings))
+    monkeypatch.chdir(tmp_path)
+    exec(snippet("from_gymnasium"), {"MyEnv": CartPoleEnv})
+    assert runs.lines(tmp_path / "runs" / "my_env")[-1]["env_steps"] >= 96
+
+
 def test_every_snippet_of_the_readme_is_run_here():
-    assert len(SNIPPETS) == 4
+    assert len(SNIPPETS) == 5

@@ -3,12 +3,16 @@
     vawm.losses         the losses as a functional library
     vawm.returns, vawm.transforms, vawm.distributions   what they are made of
     vawm.envs           18 tasks of the DeepMind Control Suite on MJX, and probes
+    vawm.envs.host      Atari, DMC vision and Gymnasium, stepped in processes of their own
     vawm.world_model, vawm.actor_critic, vawm.agent     the agent as pure functions
-    vawm.objective, vawm.train                          its loss, its update, one jitted step
-    vawm.runner, vawm.checkpoint, vawm.evaluate         runs on disk
+    vawm.objective, vawm.learner                        its loss, its update
+    vawm.train, vawm.host_train         the step around MJX, and around host environments
+    vawm.runner, vawm.checkpoint        runs on disk
+    vawm.evaluate, vawm.scores          protocols of the suites, and published scores
     vawm.load           a policy from a run's checkpoint
 
-Importing the package registers its tasks with Gymnasium as "vawm/<task>-v0".
+Importing the package registers its tasks with Gymnasium as "vawm/<task>-v0", and
+"vawm/GridWorld-v0".
 """
 
 from __future__ import annotations
