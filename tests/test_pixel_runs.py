@@ -54,7 +54,9 @@ def run(request, tmp_path_factory):
         pytest.skip(rendering.fault("egl"))
     config = CONFIGS[request.param]
     logdir = tmp_path_factory.mktemp(request.param)
-    runner.run(config, logdir, console=runs.quiet())
+    console = runs.quiet()
+    runner.run(config, logdir, console=console)
+    assert f"python -m vawm.evaluate --logdir {logdir}" in console.file.getvalue()
     return logdir, config
 
 
