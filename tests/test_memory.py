@@ -101,6 +101,11 @@ def pixels(monkeypatch, backend, images="device", env_steps=20_000_000):
     )
     spec = EnvSpec("test", image(64), 6, False, config.num_envs, 2, 500)
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    return on_the_host(spec, config)
+
+
+def on_the_host(spec, config):
+    """Estimates for environments of `spec` on the host, and the config."""
     agent = make_agent(config, spec)
     timestep = host_train.first_timestep(spec)
     state = jax.eval_shape(
@@ -108,7 +113,7 @@ def pixels(monkeypatch, backend, images="device", env_steps=20_000_000):
         jax.random.key(0),
         timestep,
     )
-    if images == "host":
+    if config.replay.images == "host":
         capacity = state.replay.trajectory.reward.shape[1]
         ring = image_store.specs(spec.obs, num_envs=config.num_envs, capacity=capacity)
         state = state._replace(images=ring)
@@ -178,6 +183,34 @@ def test_the_estimate_is_not_below_what_was_measured_nor_far_above(
     (needed,) = memory.estimate(state, env.spec, config)
     total = needed.total
     assert measured < total / 2**30 < 1.4 * measured
+
+
+# The same with environments on the host: breakout and cartpole_balance from pixels for 6,000
+# env steps, walker_walk from pixels until 3 updates were done.
+MEASURED_ON_THE_HOST = [
+    (dataclasses.replace(presets.ATARI_QUICK, env_steps=6_000), 2.23),
+    (dataclasses.replace(presets.VISION_QUICK, env_steps=6_000), 2.76),
+    (dataclasses.replace(presets.VISION_PAPER, env_steps=4_300), 8.60),
+]
+
+
+@pytest.mark.parametrize(
+    ("config", "measured"), MEASURED_ON_THE_HOST, ids=["atari", "vision", "vision-12m"]
+)
+def test_the_estimate_covers_images_and_workers_and_little_more(config, measured, monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
+    monkeypatch.setattr(memory.os, "cpu_count", lambda: 2)
+    spec = EnvSpec(
+        "test",
+        image(64),
+        6,
+        config.suite == "atari100k",
+        config.num_envs,
+        config.action_repeat,
+        None,
+    )
+    needed, _ = on_the_host(spec, config)
+    assert measured < needed[0].total / 2**30 < 1.4 * measured
 
 
 def test_a_model_that_does_not_fit_alone_is_not_blamed_on_replay():

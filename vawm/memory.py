@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax
 
 from vawm import nets
-from vawm.config import Config, HostEnvConfig
+from vawm.config import Config, HostEnvConfig, VisionConfig
 from vawm.errors import InvalidInput
 from vawm.manifest import leaf_info
 from vawm.types import EnvSpec, PyTree, is_image
@@ -33,14 +33,19 @@ PROCESS_BYTES = 2600 * 2**20
 
 A `quick` run of cartpole peaks at 2.5 GiB (glibc's huge pages on), of which 0.1 are its
 state. Rounded up, since larger domains compile longer."""
+HOST_PROCESS_BYTES = 1800 * 2**20
+"""The same where environments run on the host: without MJX. Measured 1.4 to 1.7 GiB."""
 COMPILER_BYTES = 400 * 2**20  # of an accelerator's memory, for its context and programs
-WORKER_BYTES = 400 * 2**20
-"""Of each process with environments: imports and a rendering context."""
+WORKER_BYTES = 200 * 2**20
+"""Of each process with environments, for imports: 100 MiB, 200 with dm_control."""
+RENDERER_BYTES = 70 * 2**20
+"""Of each environment that is rendered on a CPU, as `VisionSimulator` says."""
 WORKING_FACTOR = 4
 """Measured per counted activation: 0.7 GB at size 1m for a batch of 16 x 64, 3.3 times
 what `working_bytes` counts; rounded up."""
-IMAGE_FACTOR = 3
-"""Measured per number in the maps of images."""
+IMAGE_FACTOR = 2
+"""Measured per number in the maps of images, for a batch of 16 x 64: 1.1 at size 1m, 1.7 at
+12m; rounded up."""
 
 
 class Estimate(NamedTuple):
@@ -108,7 +113,9 @@ def estimate(state: PyTree, spec: EnvSpec, config: Config) -> tuple[Estimate, ..
         process=COMPILER_BYTES,
         copies=1,
     )
-    process = PROCESS_BYTES + worker_bytes(config)
+    process = PROCESS_BYTES
+    if isinstance(config.env, HostEnvConfig):
+        process = HOST_PROCESS_BYTES + worker_bytes(config)
     if jax.default_backend() == "cpu":
         return (device._replace(images=images, process=process, copies=2),)
     # The state passes through the host's memory on its way to and from a checkpoint.
@@ -123,9 +130,10 @@ def process_bytes() -> int:
 
 def worker_bytes(config: Config) -> int:
     """What the processes of environments on the host take."""
-    if not isinstance(config.env, HostEnvConfig):
-        return 0
-    return WORKER_BYTES * (config.env.workers or min(config.num_envs, os.cpu_count() or 1))
+    assert isinstance(config.env, HostEnvConfig)
+    workers = min(config.num_envs, config.env.workers or os.cpu_count() or 1)
+    rendered = config.num_envs if isinstance(config.env, VisionConfig) else 0
+    return WORKER_BYTES * workers + RENDERER_BYTES * rendered
 
 
 def nbytes(tree: PyTree) -> int:
