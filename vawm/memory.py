@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import pathlib
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -11,6 +10,7 @@ import jax
 
 from vawm import nets
 from vawm.config import Config, HostEnvConfig, VisionConfig
+from vawm.envs.host.crew import cores
 from vawm.errors import InvalidInput
 from vawm.manifest import leaf_info
 from vawm.types import EnvSpec, PyTree, is_image
@@ -43,6 +43,9 @@ RENDERER_BYTES = 70 * 2**20
 WORKING_FACTOR = 4
 """Measured per counted activation: 0.7 GB at size 1m for a batch of 16 x 64, 3.3 times
 what `working_bytes` counts; rounded up."""
+SAVING_COPIES = 3
+"""While a checkpoint is written: what it holds, Orbax's copy, and that compressed. Measured
+2.3 for bytes of 2 bits each, 2.9 for random floats."""
 IMAGE_FACTOR = 2
 """Measured per number in the maps of images, for a batch of 16 x 64: 1.1 at size 1m, 1.7 at
 12m; rounded up."""
@@ -53,8 +56,7 @@ class Estimate(NamedTuple):
 
     `where` is "device", or "host" for the memory of the machine beside an accelerator; on a
     CPU both are one, called device. `images` are those that replay keeps on the host. `copies`
-    of what a checkpoint holds are in the same memory at once: two where it is written from,
-    and read into, the memory of the run.
+    of what a checkpoint holds are in the same memory at once, see `SAVING_COPIES`.
     """
 
     where: str
@@ -83,7 +85,7 @@ class Estimate(NamedTuple):
             "parameters": self.params,
             "optimiser": self.optimizer,
             "environments and the rest": self.other_state,
-            "a copy of these for checkpoints": (self.copies - 1) * self.state,
+            "copies of these while saving": (self.copies - 1) * self.state,
             "working memory": self.working,
             "processes": self.process,
         }
@@ -117,10 +119,11 @@ def estimate(state: PyTree, spec: EnvSpec, config: Config) -> tuple[Estimate, ..
     if isinstance(config.env, HostEnvConfig):
         process = HOST_PROCESS_BYTES + worker_bytes(config)
     if jax.default_backend() == "cpu":
-        return (device._replace(images=images, process=process, copies=2),)
-    # The state passes through the host's memory on its way to and from a checkpoint.
-    host = device._replace(where="host", images=images, working=0, process=process)
-    return device, host
+        return (device._replace(images=images, process=process, copies=SAVING_COPIES),)
+    # The state passes through the host's memory on its way to a checkpoint.
+    return device, device._replace(
+        where="host", images=images, working=0, process=process, copies=SAVING_COPIES
+    )
 
 
 def process_bytes() -> int:
@@ -131,7 +134,7 @@ def process_bytes() -> int:
 def worker_bytes(config: Config) -> int:
     """What the processes of environments on the host take."""
     assert isinstance(config.env, HostEnvConfig)
-    workers = min(config.num_envs, config.env.workers or os.cpu_count() or 1)
+    workers = min(config.num_envs, config.env.workers or cores())
     rendered = config.num_envs if isinstance(config.env, VisionConfig) else 0
     return WORKER_BYTES * workers + RENDERER_BYTES * rendered
 
