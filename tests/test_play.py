@@ -62,7 +62,7 @@ def test_which_episodes_count_is_fixed_before_they_are_played(env, episodes):
     num_envs = env.spec.num_envs
     score = evaluate.evaluate(policy(env.spec), episodes=episodes, env=env, seed=SEED)
     expected = [
-        length_of(episode_seed(SEED, i, k))
+        length_of(episode_seed(play.FRESH + SEED, i, k))
         for i in range(num_envs)
         for k in range(len(range(i, episodes, num_envs)))
     ]
@@ -70,10 +70,24 @@ def test_which_episodes_count_is_fixed_before_they_are_played(env, episodes):
     assert len(score.returns) == episodes
 
 
-def test_short_episodes_are_not_favoured(env):
-    """The first to finish would be short ones: the mean over what counts is that of all."""
-    score = play.on_host(env, policy(env.spec), episodes=300, seed=SEED)
-    assert score.mean == pytest.approx(5.0, abs=0.5)
+def test_no_episode_of_training_is_played():
+    trained = {episode_seed(SEED, i, k) for i in range(8) for k in range(1000)}
+    played = {episode_seed(play.FRESH + SEED, i, k) for i in range(8) for k in range(1000)}
+    assert not trained & played
+
+
+def test_short_episodes_are_not_favoured():
+    """Of 8 environments the first 8 to finish would be short ones, often two of the same."""
+    with Pool(Uneven, task="uneven", num_envs=8, workers=1) as env:
+        scores = [
+            play.on_host(env, policy(env.spec), episodes=8, seed=seed) for seed in range(40)
+        ]
+    counted = [length for score in scores for length in score.returns]
+    drawn = [
+        length_of(episode_seed(play.FRESH + seed, i, 0)) for seed in range(40) for i in range(8)
+    ]
+    assert counted == drawn
+    assert np.mean(counted) == pytest.approx(5.0, abs=0.5)  # of lengths 1 to 9
 
 
 def test_rewards_are_those_of_the_policy_s_actions(env):

@@ -47,9 +47,15 @@ def test_errors_leave_out_what_a_reset_has_cut():
 
 def test_a_prediction_that_is_not_finite_is_no_number():
     predicted = np.full((2, 4, 8, 8, 3), np.nan)
-    with np.errstate(invalid="ignore"):
-        made = video.open_loop_video(sequences(0), predicted, np.ones((2, 4), bool), context=1)
-    assert all(error is None or np.isfinite(error) for error in made.numbers["error"])
+    made = video.open_loop_video(sequences(0), predicted, np.ones((2, 4), bool), context=1)
+    assert made.numbers["error"] == [None] * 4
+
+
+def test_the_error_is_that_of_what_was_predicted_in_all_channels():
+    truth = np.concatenate([sequences(0), sequences(255)[..., :1]], -1)
+    predicted = np.full((2, 4, 8, 8, 4), 0.001)  # less than a byte tells apart
+    made = video.open_loop_video(truth, predicted, np.ones((2, 4), bool), context=1)
+    assert made.numbers["error"] == pytest.approx([(3 * 0.001**2 + 0.999**2) / 4] * 4)
 
 
 def test_images_of_a_mixture_are_shown_side_by_side_and_grey_as_grey():

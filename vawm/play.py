@@ -24,6 +24,10 @@ from vawm.types import Array, TimeStep
 
 How = Literal["sample", "mode"]
 
+FRESH = 2**32
+"""Added to the seed of an evaluation on the host. Seeds of runs are below, so that none of its
+episodes was trained on."""
+
 
 class Score(NamedTuple):
     """Returns of whole episodes.
@@ -107,7 +111,7 @@ def on_host(
     share = np.array([len(range(i, episodes, num_envs)) for i in range(num_envs)])
     returns: list[list[float]] = [[] for _ in range(num_envs)]
     carry, key, total = policy.initial(num_envs), jax.random.key(seed), np.zeros(num_envs)
-    timestep = env.reset(seed)
+    timestep = env.reset(FRESH + seed)
     while any(len(own) < wanted for own, wanted in zip(returns, share, strict=True)):
         key, key_act = jax.random.split(key)
         carry, action = policy.act(key_act, carry, timestep, how)

@@ -50,12 +50,13 @@ def make(program: Program, config: Config) -> Callable[[TrainState], list[Video]
     if not config.video.every:
         return None
     choices, classes = config.video, config.world_model.classes
+    on_host = config.replay.images == "host"
     predict = jax.jit(make_open_loop(program.agent, context=choices.context))
     look_up = jax.jit(lambda buffer, at: replay.read(buffer, at, classes=classes))
 
     def look(state: TrainState, positions: Positions) -> Batch:
         trajectory, context = look_up(state.replay, positions)
-        images = image_store.read(state.images, positions) if state.images else ()
+        images = image_store.read(state.images, positions) if on_host else ()
         obs = image_store.merge(trajectory.obs, images)
         return Batch(trajectory._replace(obs=obs), context)
 
@@ -101,13 +102,14 @@ def open_loop_video(
     """Truth, prediction and their difference, one above the other; sequences side by side.
 
     The border is green while the world model sees, red while it imagines. The difference is
-    grey where there is none. `numbers` has the mean squared error of a pixel in [0, 1] for
-    each step, over the sequences that no reset has cut; None where it has cut all.
+    grey where there is none. `numbers` has the mean squared error of a pixel in [0, 1], over
+    all channels, for each step and the sequences that no reset has cut; None where it has cut
+    all, or where a prediction is not finite.
     """
+    error = squared_error(truth, predicted)
+    kept = [error[same_episode[:, t], t] for t in range(error.shape[1])]
     pixels = side_by_side(truth).astype(np.float32) / 255
     guess = side_by_side(jax.tree.map(to_bytes, predicted, truth)).astype(np.float32) / 255
-    error = np.square(guess - pixels).mean((2, 3, 4))
-    kept = [error[same_episode[:, t], t] for t in range(error.shape[1])]
     numbers = {
         "context": context,
         "error": [mean_or_none(step) for step in kept],
@@ -126,11 +128,22 @@ def mean_or_none(values: np.ndarray) -> float | None:
     return mean if np.isfinite(mean) else None
 
 
+def squared_error(truth: PyTree, predicted: PyTree) -> np.ndarray:
+    """Mean over all pixels and channels of the images, `[B, T]`, as they were predicted."""
+    errors = [
+        np.square(np.asarray(guess, np.float64) - pixels / 255.0)
+        for pixels, guess in zip(jax.tree.leaves(truth), jax.tree.leaves(predicted), strict=True)
+        if is_image(pixels)
+    ]
+    flat = [error.reshape(*error.shape[:2], -1) for error in errors]
+    return np.concatenate(flat, axis=-1).mean(-1)
+
+
 def to_bytes(predicted: np.ndarray, like: np.ndarray) -> np.ndarray:
-    """Images in [0, 1] as bytes; vectors are left alone, nobody looks at them."""
+    """Images in [0, 1] as bytes, what is not finite black; vectors are left alone."""
     if not is_image(like):
         return like
-    return np.round(255 * np.clip(predicted, 0, 1)).astype(np.uint8)
+    return np.round(255 * np.clip(np.nan_to_num(predicted), 0, 1)).astype(np.uint8)
 
 
 def framed(images: np.ndarray, color: tuple[int, int, int]) -> np.ndarray:
