@@ -90,6 +90,18 @@ class Troubled(Walk):
         return outcome._replace(reward=float("nan"))
 
 
+class BadEnd(Troubled):
+    """One that has been in trouble does not survive being closed either."""
+
+    def __init__(self, trouble, *, step, end):
+        super().__init__(trouble, step=step)
+        self.end = end
+
+    def close(self):
+        if self.seed in self.trouble:
+            getattr(self, self.end)(None)
+
+
 class Echo:
     """Shows the action that it got."""
 

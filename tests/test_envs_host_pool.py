@@ -15,7 +15,7 @@ import time
 import host_simulators
 import numpy as np
 import pytest
-from host_simulators import Chance, Changed, Echo, Parent, Slow, Troubled, Walk
+from host_simulators import BadEnd, Chance, Changed, Echo, Parent, Slow, Troubled, Walk
 
 from vawm.envs.host import channel, pool, worker
 from vawm.envs.host.pool import EnvironmentFailure, Episodes, Pool, episode_seed
@@ -393,6 +393,19 @@ def test_a_failure_can_begin_a_new_episode_instead():
         assert not play(envs, np.zeros((2, 2, 2)))[1].is_first[1]
 
 
+@pytest.mark.parametrize("end", ["exit", "hang"])
+def test_a_broken_simulator_that_cannot_even_be_closed_is_replaced(end):
+    """It takes its worker with it, and the other environment in there."""
+    plan = {episode_seed(SEED, 1, 0): "boom"}
+    settings = {"num_envs": 2, "workers": 1, "timeout": TIMEOUT, "on_failure": "restart"}
+    with Pool(lambda: BadEnd(plan, step=2, end=end), task="bad", **settings) as envs:
+        envs.reset(SEED)
+        _, failed = play(envs, np.zeros((2, 2, 2)))
+        assert failed.is_first.tolist() == [True, True]
+        assert envs.restarts == 2
+        assert not play(envs, np.zeros((1, 2, 2)))[0].is_first.any()
+
+
 @pytest.mark.parametrize("on_failure", ["raise", "restart"])
 def test_a_worker_that_is_killed_from_outside_is_noticed(on_failure):
     with Pool(Walk, task="w", num_envs=3, workers=2, on_failure=on_failure) as envs:
@@ -653,17 +666,18 @@ def test_a_forgotten_pool_ends():
 SCRIPT = """
 import os, signal, sys, threading, time
 import numpy as np
-from host_simulators import Loud, Troubled
+from host_simulators import Loud, Parent, Troubled
 from vawm.envs.host.pool import Pool
 
 class Here(Loud):  # known to this script alone
     pass
 
 def begin():
-    global envs
-    make = {"hang": lambda: Troubled("hang", step=1), "loud": Here}[sys.argv[1]]
+    global envs, begun
+    makers = {"hang": lambda: Troubled("hang", step=1), "loud": Here, "parent": Parent}
+    make = makers[sys.argv[1]]
     envs = Pool(make, task="script", num_envs=2, workers=1)
-    envs.reset(0)
+    begun = envs.reset(0)
 
 if sys.argv[2] == "thread":
     thread = threading.Thread(target=begin)
@@ -672,6 +686,8 @@ if sys.argv[2] == "thread":
 else:
     begin()
 signal.signal(signal.SIGINT, lambda *_: print("interrupted", flush=True))
+if sys.argv[1] == "parent":
+    print(*begun.obs[:, 0].astype(int), end=" ")
 envs.send(np.zeros((2, 2)))
 print(*(handle.process.pid for handle in envs._crew._handles), flush=True)
 if sys.argv[1] == "loud":
@@ -710,6 +726,14 @@ def test_workers_end_with_a_parent_that_is_killed(thread):
         assert all(map(alive, workers))
         process.kill()
         assert wait_until(lambda: not any(map(alive, workers)))
+
+
+def test_what_simulators_started_ends_with_a_parent_that_is_killed():
+    with script("parent", "main") as (process, running):
+        assert len(running) == 3  # two children of simulators, and their worker
+        assert all(map(alive, running))
+        process.kill()
+        assert wait_until(lambda: not any(map(alive, running)))
 
 
 def test_ctrl_c_is_for_the_parent_and_chatter_for_standard_error():

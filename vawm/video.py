@@ -132,7 +132,9 @@ def squared_error(truth: PyTree, predicted: PyTree) -> np.ndarray:
     """Mean over all pixels and channels of the images, `[B, T]`, as they were predicted."""
     errors = [
         np.square(np.asarray(guess, np.float64) - pixels / 255.0)
-        for pixels, guess in zip(jax.tree.leaves(truth), jax.tree.leaves(predicted), strict=True)
+        for pixels, guess in zip(
+            jax.tree.leaves(truth), jax.tree.leaves(predicted), strict=True
+        )
         if is_image(pixels)
     ]
     flat = [error.reshape(*error.shape[:2], -1) for error in errors]

@@ -16,7 +16,7 @@ import sys
 import threading
 import time
 import weakref
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 import numpy as np
@@ -189,8 +189,16 @@ class Crew:
             empty += handle.envs
         return empty
 
-    def tell(self, name: str, payloads: Mapping[int, Any]) -> None:
-        """Gives an order to the workers of some environments; `hear` waits for it."""
+    def tell(
+        self, name: str, payloads: Mapping[int, Any], *, timeout: float | None = None
+    ) -> None:
+        """Gives an order to the workers of some environments; `hear` waits for it.
+
+        Args:
+          name: of a method of `Worker`.
+          payloads: environment -> its argument.
+          timeout: in which a worker has to take it, in place of the usual one.
+        """
         self._ticket += 1
         self._told = []
         for handle in self._handles:
@@ -199,7 +207,7 @@ class Crew:
                 self._told.append(handle)
                 with contextlib.suppress(OSError):  # `hear` finds out why
                     order = self._ticket, name, part
-                    handle.channel.send(order, timeout=self.timeout)
+                    handle.channel.send(order, timeout=timeout or self.timeout)
 
     def hear(
         self, *, timeout: float | None = None
@@ -234,7 +242,7 @@ class Crew:
         self, factories: Mapping[int, bytes], *, timeout: float
     ) -> tuple[dict[int, Description], dict[int, Trouble]]:
         """Makes simulators; returns what `hear` does, every failure marked as one to build."""
-        self.tell("build", factories)
+        self.tell("build", factories, timeout=timeout)
         results, troubles = self.hear(timeout=timeout)
         for handle in self._told:
             handle.ready = not troubles.keys() & set(handle.envs)
@@ -244,6 +252,16 @@ class Crew:
             else trouble._replace(building=True, reason=f"could not be made: {trouble.reason}")
             for env, trouble in troubles.items()
         }
+
+    def discard(self, envs: Collection[int]) -> dict[int, Trouble]:
+        """Lets go of simulators, before others take their place.
+
+        Returns:
+          Environments that were lost with a worker, where closing one ended or hung it.
+        """
+        alive = [env for handle in self._handles if handle.ready for env in handle.envs]
+        self.tell("close", {env: None for env in alive if env in envs})
+        return self.hear()[1]
 
     def close(self) -> None:
         """Lets the simulators close and ends all workers; a second call does nothing."""

@@ -200,6 +200,7 @@ class Pool:
         played = {env: (self._seed_of(env), parts[env]) for env in kept_whole}
         self._crew.tell("replay", played)
         _, troubles = self._crew.hear()
+        troubles = self._crew.discard(troubles) | troubles
 
         is_first = length == 0
         same = ~self._mask(troubles) & (length >= 0)
@@ -297,6 +298,7 @@ class Pool:
         anew = self._mask(())
         while troubles:
             self._judge(troubles)
+            troubles = self._crew.discard(troubles) | dict(troubles)
             self.restarts += len(troubles)
             anew |= self._mask(troubles)
             self._build(troubles)

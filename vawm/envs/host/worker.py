@@ -146,8 +146,7 @@ class Worker:
         self.control["began"][self.index] = time.monotonic()
 
     def build(self, env: int, factory: bytes) -> Description:
-        """Makes the simulator, in place of one that failed; each from its own copy."""
-        self.close(env)
+        """Makes the simulator, each from its own copy."""
         try:
             simulator = pickle.loads(factory)()
             self.description = describe_simulator(simulator)
@@ -326,6 +325,7 @@ def main() -> None:
         signal.signal(number, lambda *_: None)
     # It is in the background of a terminal, which may stop those that print.
     signal.signal(signal.SIGTTOU, signal.SIG_IGN)
+    leave_a_guard()
     end_with(settings["parent"], by_kernel=settings["by_kernel"])
     faulthandler.enable(settings["crash"], all_threads=False)
     faulthandler.register(TELL, settings["crash"], all_threads=False)
@@ -333,6 +333,27 @@ def main() -> None:
     place = settings["index"], settings["workers"], settings["num_envs"]
     Worker(*place, channel, settings["memory"]).serve()
     os._exit(0)  # threads that a simulator left behind must not keep the process
+
+
+def leave_a_guard() -> None:
+    """Leaves a process that ends what simulators started, once this one has ended.
+
+    It is forked before there are threads, leads a group of its own, and keeps no file open:
+    by those the pool notices that this process has ended.
+    """
+    worker = os.getpid()  # leads the group of all that its simulators start
+    if os.fork():
+        return
+    os.setpgid(0, 0)
+    nothing = os.open(os.devnull, os.O_RDWR)
+    for standard in range(3):
+        os.dup2(nothing, standard)
+    os.closerange(3, os.sysconf("SC_OPEN_MAX"))
+    while os.getppid() == worker:
+        time.sleep(WATCH_SECONDS)
+    with contextlib.suppress(OSError):
+        os.killpg(worker, signal.SIGKILL)
+    os._exit(0)
 
 
 def end_with(parent: int, *, by_kernel: bool) -> None:
