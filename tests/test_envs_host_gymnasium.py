@@ -70,9 +70,10 @@ class Example(gymnasium.Env):
         (spaces.Box(0, 255, (128,), np.uint8), vector(128)),
         (spaces.Box(0, 255, (4, 7), np.uint8), vector(28)),
         (spaces.Box(0, 255, (15, 15), np.uint8), vector(225)),
-        (spaces.Box(0, 255, (16, 16), np.uint8), image(16, channels=1)),
+        (spaces.Box(0, 255, (48, 48), np.uint8), image(48, channels=1)),
         (spaces.Box(0, 255, (64, 64, 3), np.uint8), image(64)),
-        (spaces.Box(0, 255, (7, 7, 3), np.uint8), image(7)),
+        (spaces.Box(0, 255, (7, 7, 3), np.uint8), vector(147)),
+        (spaces.Box(0, 1, (40, 40), np.float32), vector(1600)),
     ],
 )
 def test_an_observation_is_an_image_or_a_vector(box, spec):
@@ -84,15 +85,15 @@ def test_an_observation_is_an_image_or_a_vector(box, spec):
 
 
 def test_the_numbers_of_an_observation_keep_their_order():
-    picture = np.arange(256, dtype=np.uint8).reshape(16, 16)
+    picture = np.resize(np.arange(256, dtype=np.uint8), (48, 48))
     table = np.arange(6.0).reshape(2, 3)
     space = spaces.Dict(
-        picture=spaces.Box(0, 255, (16, 16), np.uint8),
+        picture=spaces.Box(0, 255, (48, 48), np.uint8),
         table=spaces.Box(0, 9, (2, 3), np.float64),
     )
     env = Example(observation_space=space, obs={"picture": picture, "table": table})
     simulator = GymnasiumSimulator(env)
-    assert simulator.obs == {"picture": image(16, channels=1), "table": vector(6)}
+    assert simulator.obs == {"picture": image(48, channels=1), "table": vector(6)}
     obs = simulator.reset(0)
     np.testing.assert_array_equal(obs["picture"][..., 0], picture)
     np.testing.assert_array_equal(obs["table"], np.arange(6))
@@ -161,7 +162,10 @@ def test_all_problems_come_at_once():
     class Wrong(Example):
         observation_space = spaces.Dict(
             big=spaces.Box(0, 255, (64, 64, 3), np.uint8),
-            small=spaces.Box(0, 255, (32, 32, 3), np.uint8),
+            small=spaces.Box(0, 255, (48, 48, 3), np.uint8),
+            odd=spaces.Box(0, 255, (84, 84, 3), np.uint8),
+            board=spaces.Box(0, 255, (20, 20), np.uint8),
+            real=spaces.Box(0, 1, (64, 64, 3)),
             first=spaces.Box(0, 255, (3, 64, 64), np.uint8),
             wide=spaces.Box(0, 255, (64, 96, 3), np.uint8),
             stack=spaces.Box(0, 255, (4, 84, 84, 3), np.uint8),
@@ -199,7 +203,10 @@ def test_all_problems_come_at_once():
         "observation_space['nothing'] has shape (0,), no numbers at all: leave",
         "observation_space['stack'] has bytes of shape (4, 84, 84, 3): stack",
         "observation_space['wide'] has images of shape (64, 96, 3), not square: use",
-        "images have sides of {'big': 64, 'small': 32} pixels: give all the same",
+        "observation_space['odd'] has images of 84 pixels a side, not a multiple of 16 from",
+        "observation_space['board'] has images of 20 pixels a side, not a multiple of 16",
+        "observation_space['real'] has shape (64, 64, 3) like a picture, of float32: declare",
+        "images have sides of {'big': 64, 'small': 48} pixels: give all the same",
         "action space Box(-inf, inf, (2,), float32) has no bounds: declare",
         "reset() does not accept seed=: take seed=None",
         "reset() returns one value, a dict: return obs, info",

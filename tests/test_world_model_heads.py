@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import tiny
 
-from vawm import nets
+from vawm import nets, types
 from vawm.errors import InvalidInput
 from vawm.types import ArraySpec, EnvSpec, Latent, image, vector
 from vawm.world_model.heads import make_heads
@@ -113,3 +113,7 @@ def test_predictions_of_one_kind_do_not_depend_on_the_order_of_the_keys():
 def test_observations_that_cannot_be_read_are_refused(obs, message):
     with pytest.raises(InvalidInput, match=message):
         make(obs)
+
+
+def test_sizes_of_images_are_those_that_can_be_halved():
+    assert types.IMAGE_SIZES.step == 2**nets.HALVINGS

@@ -27,6 +27,10 @@ Metrics = dict[str, jax.Array]
 ArraySpec = jax.ShapeDtypeStruct
 
 
+IMAGE_SIZES = range(48, 257, 16)
+"""Sides of the images that the CNN takes: halved four times they are 3 to 16 pixels."""
+
+
 def vector(size: int) -> ArraySpec:
     """An observation of `size` float32 numbers."""
     return ArraySpec((size,), jnp.float32)

@@ -12,9 +12,8 @@ from vawm import nets
 from vawm.config import WorldModelConfig
 from vawm.errors import InvalidInput
 from vawm.transforms import symlog
-from vawm.types import Array, EnvSpec, Key, Latent, Predictions, PyTree, is_image
+from vawm.types import IMAGE_SIZES, Array, EnvSpec, Key, Latent, Predictions, PyTree, is_image
 
-SMALLEST_MAP, LARGEST_MAP = 3, 16
 """Pixels a side that the CNN may leave of an image, as in the official code."""
 
 
@@ -153,10 +152,9 @@ def check_image_size(name: str, size: int) -> None:
     Raises:
       InvalidInput: with the sizes that can.
     """
-    factor = 2**nets.HALVINGS
-    low, high = factor * SMALLEST_MAP, factor * LARGEST_MAP
-    if size % factor or not low <= size <= high:
-        remedy = f"use a multiple of {factor} from {low} to {high}, such as 64, 96 or 128"
+    if size not in IMAGE_SIZES:
+        low, high, step = IMAGE_SIZES[0], IMAGE_SIZES[-1], IMAGE_SIZES.step
+        remedy = f"use a multiple of {step} from {low} to {high}, such as 64, 96 or 128"
         raise InvalidInput(name, size, remedy)
 
 

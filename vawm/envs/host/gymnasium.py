@@ -151,8 +151,8 @@ def check_id(name: str) -> RegisteredEnv:
     if module:
         try:
             importlib.import_module(module)
-        except ImportError as error:
-            remedy = f"module {module!r} cannot be imported: {error}"
+        except Exception as error:  # a module may raise anything
+            remedy = f"module {module!r} cannot be imported: {one_line(error)}"
             raise InvalidInput("env", name, remedy) from None
     if registered in gymnasium.registry:
         return gymnasium.registry[registered]

@@ -19,9 +19,10 @@ from gymnasium.wrappers import TimeLimit
 
 from vawm.envs.host.worker import one_line
 from vawm.errors import InvalidInput
+from vawm.types import IMAGE_SIZES
 
 SMALLEST_IMAGE = 16
-"""Pixels a side from which bytes in two dimensions are a picture and not a table."""
+"""Pixels a side from which bytes are a picture and not a table of numbers."""
 TOLERANCE = 1e-4
 """By which observations may leave their bounds, relative to them or to 1: rounding."""
 
@@ -108,25 +109,35 @@ def box_problem(space: Any) -> str:
     shape = space.shape
     if 0 in shape:
         return f"has shape {shape}, no numbers at all: leave it out"
-    if space.dtype != np.uint8 or len(shape) < 2:
+    if len(shape) < 2:
         return ""
+    if space.dtype != np.uint8:
+        if sorted(shape)[-2] < IMAGE_SIZES[0]:
+            return ""
+        remedy = "declare bytes if it is a picture, flatten it if it is none"
+        return f"has shape {shape} like a picture, of {space.dtype}: {remedy}"
     if len(shape) > 3:
         return f"has bytes of shape {shape}: stack frames along the channels, (H, W, C)"
-    table = len(shape) == 2 and min(shape) < SMALLEST_IMAGE
-    if table or shape[0] == shape[1]:
-        return ""
-    if len(shape) == 3 and shape[1] == shape[2]:
+    if len(shape) == 3 and shape[0] < SMALLEST_IMAGE <= shape[1] == shape[2]:
         remedy = "move them last with gymnasium.wrappers.TransformObservation"
         return f"has images of shape {shape}, channels first: {remedy}"
+    if not pixels(space):
+        return ""
     remedy = "use gymnasium.wrappers.ResizeObservation"
-    return f"has images of shape {shape}, not square: {remedy}"
+    if shape[0] != shape[1]:
+        return f"has images of shape {shape}, not square: {remedy}"
+    if shape[0] not in IMAGE_SIZES:
+        sizes = f"a multiple of {IMAGE_SIZES.step} from {IMAGE_SIZES[0]} to {IMAGE_SIZES[-1]}"
+        remedy += ", or FlattenObservation if it is no picture"
+        return f"has images of {shape[0]} pixels a side, not {sizes}: {remedy}"
+    return ""
 
 
 def pixels(box: Any) -> bool:
-    """Whether a `Box` without problems is of pictures."""
-    if box.dtype != np.uint8 or len(box.shape) < 2:
+    """Whether a `Box` is of pictures, if it has no problem."""
+    if box.dtype != np.uint8 or len(box.shape) not in (2, 3):
         return False
-    return len(box.shape) == 3 or min(box.shape) >= SMALLEST_IMAGE
+    return min(box.shape[:2]) >= SMALLEST_IMAGE
 
 
 def look_at_action_space(env: gymnasium.Env, add: Add) -> None:
