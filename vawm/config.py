@@ -185,8 +185,8 @@ class AtariConfig(HostEnvConfig):
     sticky: float = 0.0
     """probability that a frame repeats the action before instead; 0.25 in ALE's v5"""
     life_loss: Literal["ignore", "terminal", "end"] = "ignore"
-    """terminal: the return ends there, the episode goes on; end: the episode ends too, and
-    a new game begins"""
+    """terminal: the step and the return end there, the episode goes on; end: the episode ends
+    too, and a new game begins"""
     clip_reward: bool = False
     """to its sign"""
     max_frames: int = 108_000

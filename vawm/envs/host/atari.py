@@ -1,9 +1,11 @@
 """The 26 games of Atari 100k, played on the Arcade Learning Environment itself.
 
-The semantics are DreamerV3's, with three differences. The time limit cuts a game and does
-not end it. An observation never shows frames of before the reset or the step. And every
-reset leads to the same game: ALE's own leaves the console's memory and random numbers as
-they were, and in at least ten of the games what follows depends on them.
+The semantics are DreamerV3's, with these differences. The time limit cuts a game and does
+not end it. An observation never shows frames of before the reset or the step. Every reset
+leads to the same game: ALE's own leaves the console's memory and random numbers as they were,
+and in at least ten of the games what follows depends on them. Sticky frames are drawn here and
+not by ALE, from the seed of the episode. And the last life of bank_heist, which counts as 0, is
+a life.
 """
 
 from __future__ import annotations
@@ -71,7 +73,7 @@ class AtariSimulator:
         many, drawn from its seed. They count neither as steps nor for `max_frames`.
       sticky: probability that a frame repeats the action of the frame before, in [0, 1).
       life_loss: what losing a life does where the game goes on. "ignore": nothing.
-        "terminal": `is_terminal` without `is_last`; the game is that of "ignore". "end":
+        "terminal": the step stops at that frame, `is_terminal` without `is_last`. "end":
         the episode ends at that frame, and the next reset begins a new game, not the rest
         of this one, which would depend on what was played before.
       clip_reward: only the sign of a step's reward is given.
@@ -152,8 +154,8 @@ class AtariSimulator:
             raise InvalidInput("action", action, remedy)
         chosen = self._actions[int(action)]
         reward, played = 0.0, 0
-        lost = over = is_last = False
-        while played < self._frame_skip and not is_last:
+        is_last = is_terminal = False
+        while played < self._frame_skip and not (is_last or is_terminal):
             if self._random.random() >= self._sticky:
                 self._held = chosen
             reward += self._ale.act(self._held)
@@ -163,15 +165,16 @@ class AtariSimulator:
             over = self._over()
             lives = self._ale.lives()
             # Not "and still above 0": the last life of bank_heist counts as 0.
-            lost |= lives < self._lives and not over
+            lost = lives < self._lives and not over
             self._lives = lives
             ended = over or (lost and self._life_loss == "end")
             is_last = ended or self._frames >= self._max_frames
+            is_terminal = over or (lost and self._life_loss != "ignore")
         return Outcome(
             obs=self._resize(self._screens[:played].max(axis=0)),
             reward=float(np.sign(reward)) if self._clip_reward else reward,
             is_last=is_last,
-            is_terminal=over or (lost and self._life_loss != "ignore"),
+            is_terminal=is_terminal,
         )
 
     def close(self) -> None:
