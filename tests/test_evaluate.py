@@ -59,8 +59,21 @@ def test_the_seed_decides():
 
 
 def test_no_episodes_are_refused():
-    with pytest.raises(InvalidInput, match="episodes=0: use a number of at least 1"):
+    with pytest.raises(InvalidInput, match="episodes=0: use a whole number of at least 1"):
         evaluate.dmc_proprio(scripted(CARTPOLE, 0.0), episodes=0)
+
+
+@pytest.mark.parametrize("suite", ["dmc_vision", "atari100k", "gymnasium"])
+def test_a_policy_is_evaluated_by_the_protocol_of_its_suite(suite):
+    with pytest.raises(InvalidInput, match=r"policy='trained in dmc_proprio': .*dmc_proprio$"):
+        evaluate.PROTOCOLS[suite](scripted(CARTPOLE, 0.0))
+
+
+def test_environments_of_another_kind_are_refused():
+    env = probes.make("observation_reward", num_envs=4)
+    other = env.spec._replace(action_repeat=2)
+    with pytest.raises(InvalidInput, match=r"env='action_repeat 1': .* trained with 2"):
+        evaluate.evaluate(scripted(other, 0.0), episodes=4, env=env)
 
 
 def test_the_same_policy_plays_in_the_simulation_of_dm_control():
@@ -125,7 +138,7 @@ def test_the_command_line_reports_each_simulation(saved, monkeypatch, capsys):
     ("flags", "message"),
     [
         (["--logdir", "."], "logdir='.': holds no checkpoint"),
-        (["--logdir", ".", "--episodes", "0"], "episodes=0: use a number of at least 1"),
+        (["--logdir", ".", "--episodes", "0"], "episodes=0: use a whole number of at least 1"),
         (["--logdir", ".", "--seed", "-1"], "seed=-1: use a number from 0"),
         ([], "--logdir=None: is required"),
         (["--logdir", ".", "--physics", "mujok"], "--physics='mujok': did you mean 'mujoco'"),

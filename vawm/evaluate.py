@@ -7,8 +7,9 @@
     atari100k     100 games to their end, whole scores, no sticky actions; human-normalised
     gymnasium     20 episodes
 
-Actions are sampled, as in training and in the official DreamerV3; `how="mode"` takes the
-policy's mode. Every episode that is begun to be counted is counted, once.
+Actions are sampled from the policy, as in the official DreamerV3, whatever the temperature it
+collected with; `how="mode"` takes its mode. Every episode that is begun to be counted is
+counted, once. On the host, none of them is an episode that the run was trained on.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from vawm import cache, envs, flags, huge_pages, play, scores, suites
 from vawm import policy as policy_lib
 from vawm.command_line import guard
 from vawm.config import HostEnvConfig
-from vawm.envs.protocol import Environment, HostEnvironment
+from vawm.envs.protocol import Environment, HostEnvironment, check_positive
 from vawm.errors import InvalidInput
 from vawm.play import How, Score
 from vawm.policy import Policy
@@ -53,10 +54,12 @@ def evaluate(
       seed: of the episodes and of the actions.
 
     Raises:
-      InvalidInput: a number of episodes that is not positive, or an impossible seed.
+      InvalidInput: a number of episodes that is not positive, an impossible seed, or
+        environments of another kind than the policy's.
       EnvironmentFailure: an environment on the host failed.
     """
     check(episodes, seed)
+    check_env(policy, env)
     if not isinstance(env, Environment):
         return play.on_host(env, policy, episodes=episodes, seed=seed, how=how)
     if env.spec.num_envs != episodes:
@@ -72,10 +75,33 @@ def check(episodes: int, seed: int) -> None:
     Raises:
       InvalidInput: names the number and the remedy.
     """
-    if episodes < 1:
-        raise InvalidInput("episodes", episodes, "use a number of at least 1")
+    check_positive("episodes", episodes)
     if not 0 <= seed < 2**31:
         raise InvalidInput("seed", seed, f"use a number from 0 to {2**31 - 1}")
+
+
+def check_env(policy: Policy, env: Environment | HostEnvironment) -> None:
+    """Refuses environments whose observations, actions or action repeat are not the policy's.
+
+    Raises:
+      InvalidInput: names what differs.
+    """
+    for name in ("obs", "action_size", "discrete", "action_repeat"):
+        own, theirs = getattr(policy.spec, name), getattr(env.spec, name)
+        if own != theirs:
+            raise InvalidInput("env", f"{name} {theirs}", f"the policy was trained with {own}")
+
+
+def check_suite(policy: Policy, suite: str) -> None:
+    """Refuses a policy that was trained in another suite.
+
+    Raises:
+      InvalidInput: names the protocol of its own.
+    """
+    own = policy.config.suite
+    if own != suite:
+        remedy = f"use the protocol of its own suite, evaluate.{own}"
+        raise InvalidInput("policy", f"trained in {own}", remedy)
 
 
 def dmc_proprio(
@@ -88,6 +114,7 @@ def dmc_proprio(
 ) -> Score:
     """Episodes of 1000 control steps, in the simulation of training or in dm_control's."""
     check(episodes, seed)
+    check_suite(policy, "dmc_proprio")
     if physics == "mujoco":
         return play.in_mujoco(policy, episodes=episodes, seed=seed, how=how)
     spec = policy.spec
@@ -99,6 +126,7 @@ def dmc_vision(
     policy: Policy, *, episodes: int = 10, how: How = "sample", seed: int = 0
 ) -> Score:
     """Episodes of 1000 control steps, rendered as in training."""
+    check_suite(policy, "dmc_vision")
     return _on_host(policy, episodes=episodes, how=how, seed=seed)
 
 
@@ -115,6 +143,7 @@ def atari100k(
     Frames, no-ops and the length limit are those of training; sticky actions are off unless
     `sticky` is their probability.
     """
+    check_suite(policy, "atari100k")
     changes = {"sticky": sticky, "life_loss": "ignore", "clip_reward": False}
     return _on_host(policy, episodes=episodes, how=how, seed=seed, **changes)
 
@@ -123,6 +152,7 @@ def gymnasium(
     policy: Policy, *, episodes: int = 20, how: How = "sample", seed: int = 0
 ) -> Score:
     """Episodes of a registered environment."""
+    check_suite(policy, "gymnasium")
     return _on_host(policy, episodes=episodes, how=how, seed=seed)
 
 
