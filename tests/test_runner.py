@@ -20,6 +20,7 @@ from tensorboardX.proto.event_pb2 import SessionLog
 from vawm import checkpoint, envs, memory, runner
 from vawm.errors import InvalidInput
 from vawm.program import Program
+from vawm.runner import RunError
 
 LONG = tiny.config(env_steps=192)
 
@@ -195,6 +196,29 @@ def test_bad_input_is_refused_with_nothing_written(tmp_path, changes):
     with pytest.raises(InvalidInput):
         run(**{"config": tiny.CONFIG, "logdir": tmp_path / "run"} | changes)
     assert not list(tmp_path.iterdir())
+
+
+def test_environments_on_the_host_are_closed_where_a_run_is_refused(tmp_path):
+    class Host:
+        closed = 0
+
+        def close(self):
+            self.closed += 1
+
+    env = Host()
+    with pytest.raises(InvalidInput, match="num_envs=0"):
+        runner.run(tiny.config(num_envs=0), tmp_path / "run", env=env)
+    assert env.closed == 1
+
+
+def test_environments_that_cannot_be_started_are_one_line(tmp_path, monkeypatch):
+    def no_room(*_):
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    monkeypatch.setattr(runner, "prepare", no_room)
+    with pytest.raises(RunError, match="Too many open files; put that right"):
+        run(tiny.CONFIG, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_run_that_does_not_fit_is_refused_with_nothing_written(tmp_path, monkeypatch):

@@ -150,6 +150,22 @@ def test_videos_are_files_lines_and_events(tmp_path):
     assert image.encoded_image_string == (tmp_path / "videos" / names[0]).read_bytes()
 
 
+def test_a_resumed_run_shows_the_videos_again_that_tensorboard_dropped(tmp_path):
+    with tracking.Tracker(tmp_path) as tracker:
+        for env_steps in (40, 80, 90):
+            tracker.write_videos([film()], env_steps=env_steps)
+    before = len(events(tmp_path))
+    (tmp_path / "videos" / "episode-000000000080.gif").unlink()
+    with tracking.Tracker(tmp_path, purge_after=60) as tracker:
+        tracker.show_videos(after=60)
+    shown = [(e.step, v) for e in events(tmp_path)[before:] for v in e.summary.value]
+    ((step, value),) = shown
+    assert (step, value.tag) == (90, "video/episode")
+    gif = (tmp_path / "videos" / "episode-000000000090.gif").read_bytes()
+    assert (value.image.height, value.image.width) == (16, 24)
+    assert value.image.encoded_image_string == gif
+
+
 def test_a_video_that_cannot_be_written_leaves_no_half(tmp_path, monkeypatch):
     def full(*_):
         raise OSError(errno.ENOSPC, "No space left on device")

@@ -97,12 +97,13 @@ def run(
     logdir = pathlib.Path(logdir).expanduser()
     console = console or rich.console.Console()
     say = functools.partial(console.print, highlight=False, soft_wrap=True, markup=False)
-    check(config, logdir, resume=resume, known_task=env is None)
-    with (
-        contextlib.closing(prepare(config, env)) as program,
-        _explained(logdir),
-        rundir.claim(logdir),
-    ):
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(_explained(logdir))
+        if not isinstance(env, Environment | None):
+            stack.enter_context(contextlib.closing(env))
+        check(config, logdir, resume=resume, known_task=env is None)
+        program = stack.enter_context(contextlib.closing(prepare(config, env)))
+        stack.enter_context(rundir.claim(logdir))
         if banner:
             say(banner)
         if resume and checkpoint.latest(logdir):
@@ -193,6 +194,7 @@ def _loop(
         tracking.Tracker(logdir, purge_after=purge_after) as tracker,
         display,
     ):
+        tracker.show_videos(after=progress.logged)
         display.note("compiling (takes a minute the first time, seconds from then on) ...")
         step = program.compile(state)
         while progress.env_steps < config.env_steps and stop.signal is None:

@@ -12,6 +12,7 @@ import math
 import os
 import pathlib
 import socket
+import struct
 import time
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -151,11 +152,11 @@ class Board:
         self._add(Event(step=entry["env_steps"], summary=Summary(value=values)))
         self._file.flush()
 
-    def write_video(self, name: str, gif: bytes, shape: Sequence[int], env_steps: int) -> None:
-        """Adds an animated GIF of `[T, H, W, 3]` frames, which TensorBoard plays."""
-        _, height, width, channels = shape
+    def write_video(self, name: str, gif: bytes, env_steps: int) -> None:
+        """Adds an animated GIF in colour, which TensorBoard plays."""
+        width, height = struct.unpack("<HH", gif[6:10])  # as the format begins
         image = Summary.Image(
-            height=height, width=width, colorspace=channels, encoded_image_string=gif
+            height=height, width=width, colorspace=3, encoded_image_string=gif
         )
         self._add(
             Event(step=env_steps, summary=Summary(value=[Summary.Value(tag=name, image=image)]))
@@ -206,10 +207,20 @@ class Tracker:
             except OSError:
                 scratch.unlink(missing_ok=True)
                 raise
-            self._board.write_video(f"video/{video.name}", gif, video.frames.shape, env_steps)
+            self._board.write_video(f"video/{video.name}", gif, env_steps)
             entry = {"env_steps": env_steps, "video": path.name} | video.numbers
             with (self._logdir / VIDEO_LINES).open("a") as file:
                 file.write(as_json(entry) + "\n")
+
+    def show_videos(self, *, after: int) -> None:
+        """Gives TensorBoard the videos of a resumed run again that it dropped: those later
+        than the last line of metrics."""
+        path = self._logdir / VIDEO_LINES
+        for entry in read(path) if path.exists() else ():
+            video = self._logdir / VIDEOS / entry["video"]
+            if entry["env_steps"] > after and video.exists():
+                name = entry["video"].partition("-")[0]
+                self._board.write_video(f"video/{name}", video.read_bytes(), entry["env_steps"])
 
     def __enter__(self) -> Tracker:
         return self
