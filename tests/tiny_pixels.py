@@ -56,6 +56,15 @@ class Lamp:
         return {"clock": np.array([self.steps], np.float32), "picture": picture}
 
 
+class Picture(Lamp):
+    """The lamp alone, no dict around it."""
+
+    obs = image(48)
+
+    def _look(self):
+        return super()._look()["picture"]
+
+
 def pool(make=Lamp, **changes: Any) -> Pool:
     """Environments for `CONFIG`."""
     choices = {"workers": 1, "timeout": 30.0, "on_failure": "raise"}

@@ -13,6 +13,7 @@ times slower inside a loop.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -34,7 +35,7 @@ HostStep = Callable[[TrainState], tuple[TrainState, dict[str, Any]]]
 
 
 class Compiled(NamedTuple):
-    """The three programs of a step.
+    """The three programs of a step, and the names of what `update` measures.
 
     Attributes:
       depart: `(params, collector, replay, key) -> (collector, replay, key, key_learn)`.
@@ -46,6 +47,7 @@ class Compiled(NamedTuple):
     depart: Callable[..., tuple[Collector, Replay, Key, Key]]
     arrive: Callable[[Collector, TimeStep], tuple[Collector, Metrics]]
     update: Callable[..., tuple[Learner, Replay, Metrics]]
+    metrics: tuple[str, ...]
 
 
 def init(
@@ -97,16 +99,15 @@ def compile_programs(
     def build(function: Callable, donate: tuple[int, ...], *arguments: Any) -> Any:
         return jax.jit(function, donate_argnums=donate).lower(*arguments).compile()
 
+    update = _make_update(agent, config)
+    arguments = learner, buffer, positions, images, key, number, number
     return Compiled(
         depart=build(
             _make_depart(agent, config), (1, 2), learner.params, collector, buffer, key
         ),
         arrive=build(_make_arrive(spec), (0,), collector, timestep),
-        update=build(
-            _make_update(agent, config),
-            (0, 1),
-            *(learner, buffer, positions, images, key, number, number),
-        ),
+        update=build(update, (0, 1), *arguments),
+        metrics=tuple(jax.eval_shape(update, *arguments)[2]),
     )
 
 
@@ -114,8 +115,9 @@ def make_step(env: HostEnvironment, config: Config, programs: Compiled) -> HostS
     """Build `step(state) -> (state, metrics)`: collect K steps, then learn.
 
     Counts, credit and metrics are those of `vawm.train.make_train_step`, with `env/restarts`
-    for `env/nonfinite`: environments begun anew after a failure. The state is used up:
-    `images` is written in place, the rest donated.
+    for `env/nonfinite`: environments begun anew after a failure. An update that hides a step
+    of simulation does not wait for its count: what is warmed up by env steps sees those of
+    before that step. The state is used up: `images` is written in place, the rest donated.
 
     Raises:
       EnvironmentFailure: in `step`, when an environment fails and may not be restarted.
@@ -145,7 +147,7 @@ def make_step(env: HostEnvironment, config: Config, programs: Compiled) -> HostS
         )
         metrics = counters | {"chunk/updates": len(learned)}
         metrics |= jax.tree.map(lambda *parts: sum(parts), *arrived)
-        metrics |= {"env/restarts": env.restarts - restarts} | _mean(learned)
+        metrics |= {"env/restarts": env.restarts - restarts} | _mean(learned, programs.metrics)
         return TrainState(learner, collector, buffer, credit, key, images), metrics
 
     return step
@@ -236,8 +238,8 @@ def _batch_of_images(spec: EnvSpec, config: Config) -> PyTree:
     return image_store.merge(empty, images)
 
 
-def _mean(learned: list[Metrics]) -> dict[str, float]:
-    """Means over the updates of a chunk; nothing where there were none."""
+def _mean(learned: list[Metrics], names: tuple[str, ...]) -> dict[str, float]:
+    """Means over the updates of a chunk; NaN where there were none."""
     if not learned:
-        return {}
-    return {name: float(np.mean([m[name] for m in learned])) for name in learned[0]}
+        return dict.fromkeys(names, math.nan)
+    return {name: float(np.mean([m[name] for m in learned])) for name in names}

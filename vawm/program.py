@@ -15,6 +15,7 @@ from vawm.agent import Agent, make_agent
 from vawm.config import Config
 from vawm.envs.host.pool import Episodes
 from vawm.envs.protocol import Environment, HostEnvironment
+from vawm.errors import InvalidInput
 from vawm.train import TrainState
 from vawm.types import EnvSpec, PyTree
 
@@ -104,9 +105,12 @@ def on_host(env: HostEnvironment, agent: Agent, config: Config) -> Program:
         return host_train.make_step(env, config, programs)
 
     def resume(state: TrainState, episodes: Arrays | None) -> tuple[TrainState, int]:
+        if episodes is None:
+            remedy = "was not written with environments on the host; resume it with its own"
+            raise InvalidInput("checkpoint", "without episodes", remedy)
         collector = state.collector
         expected = jax.device_get(collector.timestep)
-        timestep, same = env.restore(seed, Episodes(**episodes or {}), expected)
+        timestep, same = env.restore(seed, Episodes(**episodes), expected)
         keep = jnp.asarray(same)
         collector = collector._replace(
             timestep=jax.tree.map(jnp.asarray, timestep),
