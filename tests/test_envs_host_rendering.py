@@ -64,8 +64,9 @@ def test_auto_takes_egl_where_it_works():
 
 
 @needs_osmesa
-def test_auto_falls_back_on_osmesa(without_egl):
-    assert rendering.choose("auto") == "osmesa"
+def test_auto_falls_back_on_osmesa_and_says_so(without_egl):
+    with pytest.warns(UserWarning, match="egl does not render here .*: osmesa does, its pix"):
+        assert rendering.choose("auto") == "osmesa"
 
 
 @needs_osmesa

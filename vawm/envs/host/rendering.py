@@ -14,6 +14,7 @@ import os
 import subprocess
 import sys
 import textwrap
+import warnings
 from typing import Literal
 
 from vawm.errors import InvalidInput
@@ -52,6 +53,9 @@ def choose(renderer: str) -> Backend:
         raise InvalidInput("env.renderer", renderer, f"use auto, {' or '.join(BACKENDS)}")
     for backend in candidates:
         if not fault(backend):
+            if backend != candidates[0]:
+                lacks = f"{candidates[0]} does not render here ({fault(candidates[0])})"
+                warnings.warn(f"{lacks}: {backend} does, its pixels differ", stacklevel=2)
             return backend
     why = ", ".join(f"{b} does not render here ({fault(b)})" for b in candidates)
     how = ", or ".join(f"apt-get install {PACKAGES[b]}" for b in candidates)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import math
+from typing import Any, cast
 
 import numpy as np
 
@@ -44,8 +45,8 @@ class VisionSimulator:
       task: one of `VISION_TASKS`.
       image_size: pixels a side.
       camera: its number in dm_control's model; -1 for the usual one.
-      renderer: "egl", "osmesa" or "auto"; see `rendering.choose`. The first simulator of a
-        process decides for all.
+      renderer: "egl", "osmesa", or "auto" for the one that `rendering.choose` finds to work.
+        The first simulator of a process decides for all.
       fast_rendering: False for exactly the pixels that dm_control renders by default.
       action_repeat: control steps per step; their rewards are summed.
 
@@ -71,7 +72,8 @@ class VisionSimulator:
         check_vision_task(task)
         check_positive("env.image_size", image_size)
         check_positive("action_repeat", action_repeat)
-        rendering.use(rendering.choose(renderer))
+        known = renderer in rendering.BACKENDS  # whoever names one has tried it
+        rendering.use(cast(Any, renderer) if known else rendering.choose(renderer))
         from dm_control import mujoco, suite
 
         domain = next(name for name in (*DOMAINS, *CAMERAS) if task.startswith(name))
