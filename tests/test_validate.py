@@ -187,6 +187,14 @@ ATARI, VISION = quick("atari100k"), quick("dmc_vision")
 @pytest.mark.parametrize(
     ("config", "message"),
     [
+        (
+            changed("env.resize", "area", changed("env.image_size", 192, ATARI)),
+            'env.image_size=192: resize="area" only makes smaller: use at most 160',
+        ),
+        (
+            changed("actor.collect_temperature", 0.1, presets.VISION_PAPER),
+            "actor.collect_temperature=0.1: use 1: only discrete policies have one",
+        ),
         (changed("env.pooling", 5, ATARI), "env.pooling=5: use at most action_repeat=4"),
         (changed("env.image_size", 60, ATARI), "env.image_size=60: use a multiple of 16"),
         (changed("env.image_size", 512, VISION), "env.image_size=512: use a multiple of 16"),

@@ -15,6 +15,7 @@ from vawm import config as config_lib
 from vawm import presets
 from vawm.config import AtariConfig, Config, VisionConfig
 from vawm.envs import EPISODE_STEPS
+from vawm.envs.host.frames import check_smaller
 from vawm.errors import InvalidInput
 from vawm.types import EnvSpec, is_image
 from vawm.world_model.heads import check_image_size
@@ -285,6 +286,13 @@ def _check_env(config: Config) -> None:
     if isinstance(config.env, AtariConfig) and config.env.pooling > repeat:
         remedy = f"use at most action_repeat={repeat}, the frames of a step"
         raise InvalidInput("env.pooling", config.env.pooling, remedy)
+    if config.suite.startswith("dmc") and config.actor.collect_temperature != 1.0:
+        remedy = "use 1: only discrete policies have one"
+        raise InvalidInput(
+            "actor.collect_temperature", config.actor.collect_temperature, remedy
+        )
+    if isinstance(config.env, AtariConfig) and config.env.resize == "area":
+        check_smaller("env.image_size", config.env.image_size)
     if isinstance(config.env, AtariConfig | VisionConfig):
         check_image_size("env.image_size", config.env.image_size)
     if config.video.every and config.video.context >= sequence:

@@ -15,6 +15,7 @@ from scipy import sparse
 from vawm.errors import InvalidInput
 
 RESIZES = ("bilinear", "area")
+SCREEN_WIDTH = 160  # of ALE in every game; a screen is higher than wide
 PRECISION = 22  # bits after the point in Pillow's weights of 8-bit images
 
 
@@ -44,9 +45,8 @@ def make_resize(
     """
     if method not in RESIZES:
         raise InvalidInput("resize", method, f"choose one of {', '.join(RESIZES)}")
-    if method == "area" and size > min(height, width):
-        remedy = f'resize="area" only makes smaller: use at most {min(height, width)}'
-        raise InvalidInput("image_size", size, remedy)
+    if method == "area":
+        check_smaller("image_size", size, largest=min(height, width))
     weights = fixed_triangle if method == "bilinear" else overlap
     between = to_byte if method == "bilinear" else unchanged
     end = to_byte if method == "bilinear" else np.rint
@@ -60,6 +60,17 @@ def make_resize(
         return end(down @ columns.T).astype(np.uint8).reshape(size, size, 3)
 
     return resize
+
+
+def check_smaller(field: str, size: int, *, largest: int = SCREEN_WIDTH) -> None:
+    """Refuses a size that "area" does not reach, because it only makes smaller.
+
+    Raises:
+      InvalidInput: names the largest.
+    """
+    if size > largest:
+        remedy = f'resize="area" only makes smaller: use at most {largest}'
+        raise InvalidInput(field, size, remedy)
 
 
 def fixed_triangle(source: int, target: int) -> np.ndarray:
