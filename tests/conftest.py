@@ -7,11 +7,20 @@ import jax
 import pytest
 
 from vawm import cache
+from vawm.envs.host import rendering
 
 os.environ.setdefault("MUJOCO_GL", "disable")  # dm_control is asked for physics only
 cache.enable()
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_debug_key_reuse", True)
+
+
+def pytest_configure(config):
+    """Where what rendering needs has been installed, no test is skipped for want of it."""
+    if os.environ.get("VAWM_TESTS_RENDER") and not hasattr(config, "workerinput"):
+        for backend in rendering.BACKENDS:
+            if fault := rendering.fault(backend):
+                raise pytest.UsageError(f"{backend} does not render here: {fault}")
 
 
 @pytest.fixture(autouse=True)

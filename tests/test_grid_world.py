@@ -33,17 +33,22 @@ def test_an_episode_has_50_steps():
 
 
 @pytest.mark.parametrize(
-    ("action", "moved"), [(0, (-1, 0)), (1, (1, 0)), (2, (0, -1)), (3, (0, 1))]
+    ("action", "moved", "stopped"),
+    [
+        (0, (-1, 0), (0, 1)),
+        (1, (1, 0), (3, 1)),
+        (2, (0, -1), (1, 0)),
+        (3, (0, 1), (1, 3)),
+    ],
 )
-def test_steps_move_one_field_and_edges_stop(world, action, moved):
+def test_steps_move_one_field_and_edges_stop(world, action, moved, stopped):
     world.goal = np.array([3, 3])
     world.walker = np.array([1, 1])
     world.step(action)
     assert tuple(world.walker - 1) == moved
     for _ in range(5):
         world.step(action)
-    assert world.walker.min() >= 0
-    assert world.walker.max() <= 3
+    assert tuple(world.walker) == stopped
 
 
 def test_a_goal_that_is_reached_is_rewarded_once_and_moves(world):
