@@ -131,7 +131,7 @@ def test_the_preset_says_what_it_is(experiment, capsys):
     assert "not the paper's setting" in text
     warmup = quick.value_alignment.warmup_steps
     assert f"value alignment: active after {warmup:,} env steps, for 94 % of the run" in text
-    assert "the warm-up is scaled to the short run (paper: 10,000 of 500,000)" in text
+    assert "the warm-up is shortened with the run (paper: 10,000 of 500,000)" in text
     assert "--preset paper" in text
 
 
@@ -167,7 +167,7 @@ WARMUP, UPDATES = "--value-alignment.warmup-steps", "--value-alignment.warmup-un
 @pytest.mark.parametrize(
     ("flags", "expected"),
     [
-        ([], "active after 7,200 env steps, for 94 % of the run; the warm-up is scaled"),
+        ([], "active after 7,200 env steps, for 94 % of the run; the warm-up is shortened"),
         (["--env-steps=5000"], "active after 300 env steps, for 94 % of the run; the warm-up"),
         (["--env-steps=500000"], "active after 30,000 env steps, for 94 % of the run\n"),
         ([WARMUP, "60000"], "active after 60,000 env steps, for 50 % of the run\n"),

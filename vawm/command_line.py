@@ -183,7 +183,7 @@ def describe(config: Config) -> str:
     )
     if not is_small(config):
         return f"{head}\nvalue alignment: {alignment}"
-    lines = [head, "  for a CPU with 2 cores and some minutes; this is not the paper's setting"]
+    lines = [head, "  for a CPU with 2 cores; this is not the paper's setting"]
     lines.append(f"  value alignment: {alignment}")
     if paper:
         lines.append(
@@ -213,7 +213,7 @@ def _describe_alignment(config: Config) -> str:
     short = is_small(config) and config.env_steps < paper.env_steps
     if short and not in_updates and warmup == scaled_warmup(config, config.env_steps):
         scale = f"{paper.value_alignment.warmup_steps:,} of {paper.env_steps:,}"
-        text += f"; the warm-up is scaled to the short run (paper: {scale})"
+        text += f"; the warm-up is shortened with the run (paper: {scale})"
     return text
 
 
