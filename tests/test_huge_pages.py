@@ -16,9 +16,9 @@ print(os.environ.get("GLIBC_TUNABLES"), sys.argv[1:])
 """
 
 
-def run(tmp_path, **environment):
+def run(tmp_path, text=PROGRAM, **environment):
     program = tmp_path / "program.py"
-    program.write_text(PROGRAM)
+    program.write_text(text)
     clean = {name: value for name, value in os.environ.items() if name != "GLIBC_TUNABLES"}
     return subprocess.run(
         [sys.executable, str(program), "--flag", "a b"],
@@ -45,6 +45,15 @@ def test_a_program_restarts_once_with_the_same_arguments(tmp_path):
 def test_other_tunables_are_kept(tmp_path):
     out = run(tmp_path, GLIBC_TUNABLES="glibc.rtld.nns=4")
     assert out.startswith("glibc.rtld.nns=4:glibc.malloc.hugetlb=1:")
+
+
+@needs_huge_pages
+def test_jax_computes_where_memory_is_kept(tmp_path):
+    """Only in a program that has restarted itself."""
+    shown = "import jax; print(jax.config._read('jax_cpu_enable_async_dispatch'))"
+    program = f"{PROGRAM}\n{shown}\n"
+    assert run(tmp_path, program).endswith("False\n")
+    assert run(tmp_path, program, VAWM_HUGE_PAGES="0").endswith("True\n")
 
 
 def test_it_can_be_turned_off(tmp_path):
