@@ -56,8 +56,12 @@ def run(request, tmp_path_factory):
     config = CONFIGS[request.param]
     logdir = tmp_path_factory.mktemp(request.param)
     console = runs.quiet()
-    runner.run(config, logdir, console=console)
+    runner.run(config, logdir, console=console, command="python train.py")
     assert f"python -m vawm.evaluate --logdir {logdir}" in console.file.getvalue()
+    assert (
+        f"go on with: python train.py --resume --logdir {logdir} --env"
+        in console.file.getvalue()
+    )
     return logdir, config
 
 

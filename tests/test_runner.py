@@ -93,13 +93,14 @@ def test_a_line_closes_each_interval_and_the_run(tmp_path, fake):
 def test_a_run_leaves_its_config_a_checkpoint_and_advice(tmp_path, fake):
     fake()
     console = quiet()
-    result = run(tiny.CONFIG, tmp_path, console=console, command="python train.py")
+    result = run(tiny.CONFIG, tmp_path, console=console)
     assert result == runner.Result(tmp_path, 96, 0)
     assert json.loads((tmp_path / "config.json").read_text())["config"]["env_steps"] == 96
     assert checkpoint.latest(tmp_path).name == "000000000096"
-    # How to evaluate where the environment is no registered one.
+    # What to do where the environment is no registered one.
     assert f"vawm.evaluate.evaluate(vawm.load({str(tmp_path)!r})" in console.file.getvalue()
-    assert f"python train.py --resume --logdir {tmp_path}" in console.file.getvalue()
+    resumption = f"vawm.runner.run(config, {str(tmp_path)!r}, env=..., resume=True), its env_st"
+    assert f"go on with: {resumption}" in console.file.getvalue()
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
@@ -185,7 +186,7 @@ def test_a_signal_in_the_last_chunk_does_not_unfinish_a_run(tmp_path, fake):
     assert run(tiny.CONFIG, tmp_path, console=console).exit_code == 130
     text = console.file.getvalue()
     assert "finished at 96 env steps" in text
-    assert "go on with: the same command --resume" in text
+    assert "go on with: vawm.runner.run(config" in text
     assert "resume with" not in text
 
 
@@ -295,7 +296,7 @@ def test_a_run_that_a_signal_stopped_goes_on_as_if_nothing_had_happened(
     result = run(LONG, tmp_path, console=console)
     assert result.exit_code == 130
     assert 84 <= result.env_steps < 192
-    assert "resume with: the same command --resume" in console.file.getvalue()
+    assert "resume with: vawm.runner.run(config" in console.file.getvalue()
     with (tmp_path / "metrics.jsonl").open("a") as file:
         file.write('{"env_steps": 10000}\n{"half a line')
     run(LONG, tmp_path, resume=True)

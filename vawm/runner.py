@@ -330,14 +330,16 @@ def _summarise(
         f"episode return: {shown}",
         f"metrics, TensorBoard events and {saved}: {result.logdir}",
     ]
+    evaluation = f"python -m vawm.evaluate --logdir {result.logdir}"
+    resumption = f"{command} --resume --logdir {result.logdir}"
+    longer = f" --env-steps {2 * config.env_steps}"
+    if not known_task:  # no command line makes its environment
+        folder = repr(str(result.logdir))
+        evaluation = f"vawm.evaluate.evaluate(vawm.load({folder}), episodes=..., env=...)"
+        resumption = f"vawm.runner.run(config, {folder}, env=..., resume=True)"
+        longer = ", its env_steps larger"
     if finished:
-        evaluation = f"python -m vawm.evaluate --logdir {result.logdir}"
-        if not known_task:
-            policy = f"vawm.load({str(result.logdir)!r})"
-            evaluation = f"vawm.evaluate.evaluate({policy}, episodes=..., env=...)"
-        text.append(f"evaluate with: {evaluation}")
-        longer = f"--env-steps {2 * config.env_steps}"
-        text.append(f"go on with: {command} --resume --logdir {result.logdir} {longer}")
+        text += [f"evaluate with: {evaluation}", f"go on with: {resumption}{longer}"]
     else:
-        text.append(f"resume with: {command} --resume --logdir {result.logdir}")
+        text.append(f"resume with: {resumption}")
     say("\n".join(text))
