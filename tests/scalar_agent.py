@@ -19,7 +19,16 @@ from vawm import transforms
 from vawm.actor_critic import Actor, Critic
 from vawm.agent import Agent
 from vawm.distributions import Policy
-from vawm.types import EnvSpec, Inference, Latent, Params, Predictions, vector
+from vawm.types import (
+    EnvSpec,
+    Explanation,
+    Inference,
+    Latent,
+    Params,
+    Predictions,
+    Targets,
+    vector,
+)
 from vawm.world_model.protocol import WorldModel
 
 CONFIG = dataclasses.replace(  # no scale is 1, so that none can be forgotten unseen
@@ -62,32 +71,45 @@ def inference(h, z):
         prior_latent=latent(h, jnp.ones_like(z)),
         post_logits=logits,
         prior_logits=jnp.zeros_like(logits),
-        has_prior=jnp.ones(h.shape, bool),
     )
 
 
-def observe(params, key, carry, obs, prev_action, is_first, *, train):
-    h, states = carry.deter, []
-    for t in range(is_first.shape[1]):
-        h = jnp.where(is_first[:, t, None], 0.0, h / 2 + prev_action[:, t]) + obs[:, t]
+def observe(batch):
+    steps = jax.tree.map(lambda x: x[:, 1:], batch.trajectory)
+    prev_action = batch.trajectory.action[:, :-1]
+    h, states = batch.context.deter, []
+    for t in range(steps.reward.shape[1]):
+        carried = jnp.where(steps.is_first[:, t, None], 0.0, h / 2 + prev_action[:, t])
+        h = carried + steps.obs[:, t]
         states.append(h[:, 0])
     h = jnp.stack(states, axis=1)
-    inferred = inference(h, jnp.zeros_like(h))
-    return jax.tree.map(lambda x: x[:, -1], inferred.latent), inferred
+    return steps, inference(h, jnp.zeros_like(h))
 
 
-def starts(params, key, trajectory, inference):
+def explain(params, state, key, batch):
+    steps, inferred = observe(batch)
+    targets = Targets(steps.obs, steps.reward, steps.is_terminal)
+    return Explanation(inferred, predict(params, state, inferred.latent), targets), state
+
+
+def starts(params, state, inference):
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), inference.latent)
     return flat, flat
 
 
-def imagine(params, key, carry, action):
+def follow(params, state, key, batch, *, horizon):
+    inferred = observe(batch)[1].latent
+    last = jax.tree.map(lambda x: x[:, -1], inferred)
+    return inferred, imagine(params, state, key, last, batch.trajectory.action[:, -1])
+
+
+def imagine(params, state, key, carry, action):
     h, z = numbers(carry)
     following = latent(h + action[..., 0], jnp.zeros_like(z))
     return following, following
 
 
-def predict(params, latent):
+def predict(params, state, latent):
     h, z = numbers(latent)
     return Predictions(obs=h[..., None], reward=around(params * h), cont=2 + h - 40 * z)
 
@@ -105,10 +127,13 @@ def policy(params, latent):
 AGENT = Agent(
     spec=EnvSpec("scalar", vector(1), 1, False, 2, 1, None),
     world_model=WorldModel(
-        init=lambda key: PARAMS.world_model,
+        init=lambda key: (PARAMS.world_model, ()),
         initial=lambda batch_size: latent(jnp.zeros(batch_size), jnp.zeros(batch_size)),
-        observe=observe,
+        memory=lambda latent: latent,
+        filter=None,
+        explain=explain,
         starts=starts,
+        follow=follow,
         imagine=imagine,
         predict=predict,
     ),
@@ -116,7 +141,6 @@ AGENT = Agent(
     critic=Critic(
         init=lambda key: PARAMS.critic,
         logits=lambda params, latent: around(params * sum(numbers(latent))),
-        mean=lambda logits: transforms.two_hot_mean(logits, BINS),
-        bins=BINS,
+        code=transforms.make_two_hot(41, "symexp"),
     ),
 )

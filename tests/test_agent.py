@@ -57,7 +57,7 @@ def spec(discrete=False):
 @pytest.mark.parametrize("size", OFFICIAL)
 def test_parameter_counts_are_the_official_ones(size):
     agent = make_agent(with_size(PAPER, size), spec())
-    params = jax.eval_shape(agent.init, jax.random.key(0))
+    params, _ = jax.eval_shape(agent.init, jax.random.key(0))
     actual = {name: parameter_count(part) for name, part in params.world_model.items()}
     actual |= {"actor": parameter_count(params.actor), "critic": parameter_count(params.critic)}
     actual["total"] = parameter_count(params)
@@ -68,7 +68,7 @@ def test_parameter_counts_are_the_official_ones(size):
 def test_parameter_counts_from_pixels_are_the_official_ones(size, actions, discrete):
     pixels = EnvSpec("test", image(64), actions, discrete, 1, 1, None)
     agent = make_agent(with_size(PAPER, size), pixels)
-    params = jax.eval_shape(agent.init, jax.random.key(0))
+    params, _ = jax.eval_shape(agent.init, jax.random.key(0))
     assert parameter_count(params) == OFFICIAL_FROM_PIXELS[size, actions, discrete]
 
 
@@ -80,21 +80,21 @@ def observation(agent, is_first, is_last):
 
 def test_acting_is_pure_and_depends_on_the_key():
     agent = make_agent(tiny.CONFIG, tiny.env().spec)
-    params, carry = agent.init(jax.random.key(0)), agent.initial(2)
+    (params, state), carry = agent.init(jax.random.key(0)), agent.initial(2)
     timestep = observation(agent, [True, True], [False, False])
     act = jax.jit(agent.act)
-    first = act(params, jax.random.key(1), carry, timestep)
-    again = act(params, jax.random.key(1), carry, timestep)
-    other = act(params, jax.random.key(2), carry, timestep)
+    first = act(params, state, jax.random.key(1), carry, timestep)
+    again = act(params, state, jax.random.key(1), carry, timestep)
+    other = act(params, state, jax.random.key(2), carry, timestep)
     jax.tree.map(np.testing.assert_array_equal, first, again)
     assert (first[1] != other[1]).all()
 
 
 def test_nothing_leaves_from_a_last_observation():
     agent = make_agent(tiny.CONFIG, tiny.env().spec)
-    params, carry = agent.init(jax.random.key(0)), agent.initial(2)
+    (params, state), carry = agent.init(jax.random.key(0)), agent.initial(2)
     timestep = observation(agent, [False, False], [True, False])
-    carry, action = agent.act(params, jax.random.key(1), carry, timestep)
+    carry, action = agent.act(params, state, jax.random.key(1), carry, timestep)
     assert (action[0] == 0).all()
     assert (action[1] != 0).all()
     np.testing.assert_array_equal(carry.action, action)
@@ -102,11 +102,11 @@ def test_nothing_leaves_from_a_last_observation():
 
 def test_a_first_observation_clears_what_was_remembered():
     agent = make_agent(tiny.CONFIG, tiny.env().spec)
-    params, fresh = agent.init(jax.random.key(0)), agent.initial(2)
+    (params, state), fresh = agent.init(jax.random.key(0)), agent.initial(2)
     full = jax.tree.map(jnp.ones_like, fresh)
     timestep = observation(agent, [True, False], [False, False])
-    _, expected = agent.act(params, jax.random.key(1), fresh, timestep)
-    _, actual = agent.act(params, jax.random.key(1), full, timestep)
+    _, expected = agent.act(params, state, jax.random.key(1), fresh, timestep)
+    _, actual = agent.act(params, state, jax.random.key(1), full, timestep)
     np.testing.assert_array_equal(actual[0], expected[0])
     assert (actual[1] != expected[1]).any()
 
@@ -115,7 +115,7 @@ def test_a_discrete_actor_gives_one_hot_actions():
     agent = make_agent(tiny.CONFIG, tiny.env().spec._replace(discrete=True, action_size=3))
     timestep = observation(agent, [True, True], [False, False])
     _, action = agent.act(
-        agent.init(jax.random.key(0)), jax.random.key(1), agent.initial(2), timestep
+        *agent.init(jax.random.key(0)), jax.random.key(1), agent.initial(2), timestep
     )
     assert action.shape == (2, 3)
     np.testing.assert_array_equal(np.sort(action, -1), [[0, 0, 1]] * 2)
@@ -141,12 +141,14 @@ def discrete_agent(temperature=1.0):
 
 def choices(agent, how, seed=1):
     """Actions of 256 environments that look all the same."""
-    params = agent.init(jax.random.key(0))
+    params, state = agent.init(jax.random.key(0))
     logits = params.actor["heads_0"]["bias"]
     params.actor["heads_0"]["bias"] = jnp.array([0.0, 1.0]).astype(logits.dtype)
     no = jnp.zeros(256, bool)
     timestep = TimeStep(jnp.zeros((256, 2)), jnp.zeros(256), ~no, no, no)
-    _, action = agent.act(params, jax.random.key(seed), agent.initial(256), timestep, how=how)
+    _, action = agent.act(
+        params, state, jax.random.key(seed), agent.initial(256), timestep, how=how
+    )
     return np.asarray(action)
 
 

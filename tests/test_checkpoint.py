@@ -99,13 +99,49 @@ def test_damage_to_what_the_host_keeps_is_noticed(tmp_path, item):
         checkpoint.restore(tmp_path, state), checkpoint.restore_episodes(tmp_path)
 
 
-def test_parameters_are_read_without_the_rest(tmp_path):
+def with_model_state():
+    """A state whose world model carries something from update to update."""
     state = toy.state()
-    shutil.rmtree(save(tmp_path, state) / "state")
-    params, _ = checkpoint.restore_params(
-        tmp_path, jax.eval_shape(lambda: state.learner.params)
-    )
-    toy.assert_equal(params, state.learner.params)
+    mean = jnp.array([0.25, -3.0])
+    statistics = {"encoder": {"mean": mean, "var": mean**2}, "decoder": {"vector": ()}}
+    return state._replace(learner=state.learner._replace(model_state=statistics))
+
+
+@pytest.mark.parametrize("make", [toy.state, with_model_state])
+def test_what_acting_needs_is_read_without_the_rest(tmp_path, make):
+    state = make()
+    learner = state.learner
+    path = save(tmp_path, state)
+    shutil.rmtree(path / "state")
+    assert (path / "model_state").exists() == bool(jax.tree.leaves(learner.model_state))
+    shapes = jax.eval_shape(lambda: (learner.params, learner.model_state))
+    restored, saved = checkpoint.restore_agent(tmp_path, *shapes)
+    toy.assert_equal(restored, (learner.params, learner.model_state))
+    assert saved.config == tiny.CONFIG
+
+
+def test_what_a_world_model_carries_comes_back_bit_for_bit(tmp_path):
+    state = with_model_state()
+    path = save(tmp_path, state)
+    restored, saved = checkpoint.restore(tmp_path, jax.eval_shape(lambda: state))
+    toy.assert_equal(restored, state)
+    assert set(saved.leaves["model_state"]) == {"['encoder']['mean']", "['encoder']['var']"}
+    assert not [name for name in saved.leaves["state"] if "model_state" in name]
+    largest = max(files_of(path / "model_state"), key=lambda file: file.stat().st_size)
+    largest.unlink()
+    with pytest.raises(InvalidInput, match="damaged"):
+        checkpoint.restore_agent(tmp_path, state.learner.params, state.learner.model_state)
+
+
+@pytest.mark.parametrize("make", [toy.state, with_model_state])
+def test_other_things_that_a_world_model_carries_are_named(tmp_path, make):
+    save(tmp_path, make())
+    learner = with_model_state().learner
+    wanted = {"encoder": {"mean": jnp.zeros(3), "var": jnp.zeros(2)}}
+    with pytest.raises(
+        InvalidInput, match=r"\['encoder'\]\['mean'\] is .*expected float32\[3\]"
+    ):
+        checkpoint.restore_agent(tmp_path, learner.params, wanted)
 
 
 @pytest.mark.parametrize(
@@ -185,6 +221,9 @@ def test_parameters_that_are_not_finite_are_not_saved(tmp_path):
     params = state.learner.params._replace(actor={"bias": jnp.array([jnp.nan])})
     with pytest.raises(checkpoint.SaveError, match=r"\.actor\['bias'\] is not finite"):
         save(tmp_path, state._replace(learner=state.learner._replace(params=params)))
+    statistics = {"mean": jnp.array([jnp.inf])}
+    with pytest.raises(checkpoint.SaveError, match=r"\['mean'\] is not finite"):
+        save(tmp_path, state._replace(learner=state.learner._replace(model_state=statistics)))
     assert checkpoint.latest(tmp_path) is None
 
 

@@ -59,6 +59,10 @@ def test_the_defaults_are_the_preset():
     assert parse("--preset=paper", "--size=25m").config == config_lib.with_size(
         presets.PAPER, "25m"
     )
+    assert parse("--agent", "storm").config == presets.STORM_QUICK
+    assert parse("--size=16m", "--agent=storm").config == config_lib.with_size(
+        presets.STORM_QUICK, "16m"
+    )
 
 
 def test_other_flags_override_preset_and_size_in_any_order():
@@ -75,11 +79,12 @@ def test_other_flags_override_preset_and_size_in_any_order():
     assert config.num_envs == presets.QUICK.num_envs
 
 
-def test_every_field_of_the_config_is_a_flag(capsys):
+@pytest.mark.parametrize("preset", [presets.QUICK, presets.STORM_QUICK])
+def test_every_field_of_the_config_is_a_flag(preset, capsys):
     with pytest.raises(SystemExit, match="0"):
-        parse("--help")
+        parse("--agent", preset.agent, "--help")
     text = capsys.readouterr().out
-    for name, _ in command_line.validate.values(presets.PAPER):
+    for name, _ in command_line.validate.values(preset):
         flag = "--" + name.replace("_", "-").replace("lambda-", "lambda_")
         assert flag in text, flag
 
@@ -97,6 +102,14 @@ def test_a_run_gets_a_folder_of_its_own():
         (["--task", "walker_wlak"], "task='walker_wlak': did you mean 'walker_walk'"),
         (["--preset", "papers"], "preset='papers': did you mean 'paper'"),
         (["--size", "13m"], "size='13m': did you mean"),
+        (["--agent", "strom"], "agent='strom': did you mean 'storm'"),
+        (["--agent", "storm", "--size", "12m"], "size='12m': did you mean '1m'"),
+        (["--agent", "storm", "--preset", "paper"], "preset='paper': use one of quick"),
+        (
+            ["--agent", "storm", "--world-model.hidden", "8"],
+            "--world-model.hidden='8': no such",
+        ),
+        (["--world-model.dropout", "0.1"], "--world-model.dropout='0.1': no such flag"),
         (["--env-steps", "0"], "env_steps=0: use a number above 0"),
         (["--replay.capacity", "100"], "replay.capacity=100: use at least"),
         (["--resume"], "logdir=None: --resume needs the --logdir"),
@@ -124,10 +137,8 @@ def test_the_preset_says_what_it_is(experiment, capsys):
     quick = presets.QUICK
     assert experiment() == 0
     text = capsys.readouterr().out
-    assert (
-        f"preset quick: dmc_proprio {quick.task}, {quick.env_steps:,} env steps, size 1m"
-        in text
-    )
+    what = f"dmc_proprio {quick.task}, {quick.env_steps:,} env steps, size 1m"
+    assert f"dreamerv3, preset quick: {what}" in text
     assert "not the paper's setting" in text
     warmup = quick.value_alignment.warmup_steps
     assert f"value alignment: active after {warmup:,} env steps, for 94 % of the run" in text
@@ -230,6 +241,7 @@ def test_resume_takes_the_settings_of_the_saved_run(saved):
     [
         (["--size", "12m"], "size='12m': the checkpoint was trained with '1m'"),
         (["--task", "walker_walk"], "task='walker_walk': the checkpoint was"),
+        (["--agent", "storm"], "agent='storm': the checkpoint was trained with 'dreamerv3'"),
         (["--preset", "paper"], "preset='paper': the checkpoint was"),
         (["--world-model.stoch", "8"], "world_model.stoch=8: the checkpoint was"),
         (["--world-model.units", "8"], "world_model.units=8: the checkpoint was"),

@@ -26,8 +26,9 @@ def scripted(spec, action):
         spec=spec,
         env_steps=0,
         params=None,
+        state=None,
         initial=lambda n: jnp.zeros(n),
-        apply=lambda params, key, carry, timestep, how: (
+        apply=lambda params, state, key, carry, timestep, how: (
             carry,
             jnp.full((carry.shape[0], 1), action),
         ),
@@ -88,23 +89,23 @@ def test_the_same_policy_plays_in_the_simulation_of_dm_control():
 
 @pytest.fixture(scope="module")
 def saved(tmp_path_factory):
-    """A folder with an untrained checkpoint, and its parameters."""
+    """A folder with an untrained checkpoint, and what acting needs of it."""
     logdir = tmp_path_factory.mktemp("saved")
     env = tiny.env()
     agent = make_agent(tiny.CONFIG, env.spec)
     state = jax.jit(lambda key: train.init(env, agent, tiny.CONFIG, key))(jax.random.key(3))
     checkpoint.save(logdir, state, env_steps=0, config=tiny.CONFIG, spec=env.spec, progress={})
-    return logdir, state.learner.params
+    return logdir, state.learner.params, state.learner.model_state
 
 
 def test_a_loaded_policy_acts_like_the_agent_that_was_saved(saved):
-    logdir, params = saved
+    logdir, *needed = saved
     env = tiny.env()
     loaded = policy.load(logdir)
     agent = make_agent(tiny.CONFIG, env.spec)
     _, timestep = env.reset(jax.random.key(0))
     carry, action = loaded.act(jax.random.key(1), loaded.initial(2), timestep)
-    expected = jax.jit(agent.act)(params, jax.random.key(1), agent.initial(2), timestep)
+    expected = jax.jit(agent.act)(*needed, jax.random.key(1), agent.initial(2), timestep)
     jax.tree.map(np.testing.assert_array_equal, (carry, action), expected)
     assert (loaded.config, loaded.spec, loaded.env_steps) == (tiny.CONFIG, env.spec, 0)
 
@@ -115,7 +116,9 @@ def test_parameters_are_arguments_of_the_compiled_program(saved):
     first = policy.load(saved[0])
     second = policy.load(saved[0])
     second = second._replace(params=jax.tree.map(lambda x: x + 1, second.params))
-    texts = [play.player(env, p).lower(p.params, key).as_text() for p in (first, second)]
+    texts = [
+        play.player(env, p).lower(p.params, p.state, key).as_text() for p in (first, second)
+    ]
     assert texts[0] == texts[1]
 
 

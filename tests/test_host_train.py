@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import tiny_pixels
+import tiny_storm
 from runs import assert_same, lines, quiet
 from tiny_pixels import Lamp, Picture
 
@@ -153,11 +154,18 @@ def test_updates_run_between_sending_and_receiving(trained):
 LONG = tiny_pixels.config(env_steps=192)
 
 
-@pytest.mark.parametrize(("images", "make"), [("device", Lamp), ("host", Picture)])
-def test_a_run_that_is_resumed_equals_one_in_one_piece(tmp_path, images, make):
-    long = tiny_pixels.config(images, env_steps=192)
+@pytest.mark.parametrize(
+    ("images", "make", "agent"),
+    [
+        ("device", Lamp, lambda config: config),
+        ("host", Picture, lambda config: config),
+        ("host", Lamp, tiny_storm.storm),
+    ],
+)
+def test_a_run_that_is_resumed_equals_one_in_one_piece(tmp_path, images, make, agent):
+    long = agent(tiny_pixels.config(images, env_steps=192))
     run(long, tmp_path / "whole", tiny_pixels.pool(make))
-    short = tiny_pixels.config(images, env_steps=104)
+    short = agent(tiny_pixels.config(images, env_steps=104))
     run(short, tmp_path / "parts", tiny_pixels.pool(make))
     run(long, tmp_path / "parts", tiny_pixels.pool(make), resume=True)
     assert_same(tmp_path / "parts", tmp_path / "whole", long, tiny_pixels.pool(make))

@@ -4,10 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import toy
 
 from vawm import image_store, replay, resume
 from vawm.replay import Positions
-from vawm.types import Latent, Trajectory, image, vector
+from vawm.types import Batch, Latent, Trajectory, image, vector
 
 SPEC = {"picture": image(4), "state": vector(2), "top": image(4, 1)}
 NUM_ENVS, CAPACITY = 2, 5
@@ -63,8 +64,13 @@ def test_what_is_taken_apart_is_whole_again_also_after_the_ring_has_wrapped(step
         batch_size=6,
         length=3,
     )
-    trajectory, _ = replay.read(buffer, positions, classes=2)
-    obs = image_store.merge(trajectory.obs, image_store.read(store, positions))
+    read = replay.read(buffer, positions, classes=2)
+    whole = image_store.complete(read, image_store.read(store, positions))
+    trajectory, context = whole
+    toy.assert_equal(context, read.context)
+    toy.assert_equal(trajectory._replace(obs=read.trajectory.obs), read.trajectory)
+    obs = image_store.merge(read.trajectory.obs, image_store.read(store, positions))
+    toy.assert_equal(trajectory.obs, obs)
     times = np.asarray(trajectory.reward).astype(int)
     for b, env in enumerate(positions.env):
         for t, time in enumerate(times[b]):
@@ -99,6 +105,8 @@ def test_what_is_read_is_a_copy():
 def test_without_images_apart_observations_pass_as_they_are():
     obs = {"a": jnp.ones(2)}
     assert image_store.merge(obs, ()) is obs
+    batch = Batch(Trajectory(obs, *[None] * 5), ())
+    assert image_store.complete(batch, ()).trajectory.obs is obs
 
 
 @pytest.mark.parametrize("steps", [3, 8])

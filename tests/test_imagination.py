@@ -18,12 +18,12 @@ from vawm.world_model.protocol import WorldModel
 def counting_model():
     """h' = h + a, z unchanged."""
 
-    def step(params, key, carry, action):
-        del key
+    def step(params, state, key, carry, action):
+        del state, key
         latent = Latent(carry.deter + params * action, carry.stoch)
         return latent, latent
 
-    return WorldModel(*[None] * 4, imagine=step, predict=None)
+    return WorldModel(*[None] * 7, imagine=step, predict=None)
 
 
 def doubling_policy(latent):
@@ -34,7 +34,7 @@ def doubling_policy(latent):
 def test_each_latent_follows_from_the_action_before_it():
     start = Latent(jnp.array([[1.0], [10.0]]), jnp.ones((2, 1, 1)))
     imagined = imagine(
-        counting_model(), doubling_policy, 1.0, jax.random.key(0), start, start, horizon=3
+        counting_model(), doubling_policy, 1.0, (), jax.random.key(0), start, start, horizon=3
     )
     np.testing.assert_array_equal(
         imagined.latent.deter[..., 0].T, [[1, 3, 9, 27], [10, 30, 90, 270]]
@@ -47,7 +47,7 @@ def test_no_gradient_leaves_imagination():
         start = Latent(deter, jnp.ones((2, 1, 1)))
         key = jax.random.key(0)
         imagined = imagine(
-            counting_model(), doubling_policy, params, key, start, start, horizon=3
+            counting_model(), doubling_policy, params, (), key, start, start, horizon=3
         )
         return imagined.latent.deter.sum() + imagined.action.sum()
 
@@ -60,12 +60,12 @@ def test_steps_and_states_draw_different_noise():
 
     @jax.jit
     def roll(key):
-        params = agent.init(jax.random.key(0))
+        params, state = agent.init(jax.random.key(0))
         start = agent.world_model.initial(2)
         carry = jnp.zeros((4, 2, 8)), start
         policy = functools.partial(agent.actor.policy, params.actor)
         return imagine(
-            agent.world_model, policy, params.world_model, key, carry, start, horizon=3
+            agent.world_model, policy, params.world_model, state, key, carry, start, horizon=3
         )
 
     imagined = roll(jax.random.key(1))

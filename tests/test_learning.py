@@ -17,7 +17,7 @@ from vawm import train
 from vawm.agent import make_agent
 from vawm.collector import make_collect
 from vawm.envs import probes
-from vawm.learner import make_learn
+from vawm.learn import make_learn
 
 CONFIG = dataclasses.replace(
     tiny.CONFIG,
@@ -57,21 +57,27 @@ def trained(name, updates, seed):
     collector, buffer, learner, key = state.collector, state.replay, state.learner, state.key
     for chunk in range(updates // 8):
         key, key_collect, key_learn = jax.random.split(key, 3)
-        collector, buffer, _ = collect(learner.params, collector, buffer, key_collect)
+        collector, buffer, _ = collect(
+            learner.params, learner.model_state, collector, buffer, key_collect
+        )
         if chunk >= 2:
             learner, buffer, _ = learn(
                 learner, buffer, key_learn, collector.env_steps, jnp.asarray(8)
             )
-    return agent, env, learner.params
+    return agent, env, learner
 
 
-def look(agent, env, params):
+def look(agent, env, learner):
     """A rollout of the trained agent: values, observations and flags, `[T, N]`."""
 
     def step(carry, key):
         policy_carry, env_state, timestep = carry
-        policy_carry, action = agent.act(params, key, policy_carry, timestep)
-        value = agent.critic.mean(agent.critic.logits(params.critic, policy_carry.latent))
+        policy_carry, action = agent.act(
+            learner.params, learner.model_state, key, policy_carry, timestep
+        )
+        # What the RSSM remembers is the latent that it inferred.
+        logits = agent.critic.logits(learner.params.critic, policy_carry.memory)
+        value = agent.critic.code.mean(logits)
         seen = value, timestep
         return (policy_carry, *env.step(env_state, action)), seen
 
@@ -114,8 +120,8 @@ def test_the_critic_learns_the_known_value(name, updates, tolerance):
 
 def error_of(name, updates, seed):
     """Mean distance of the learned value from the known one."""
-    agent, env, params = trained(name, updates, seed)
-    value, timestep = look(agent, env, params)
+    agent, env, learner = trained(name, updates, seed)
+    value, timestep = look(agent, env, learner)
     live = ~timestep.is_last
     known = probes.known_value(
         name,

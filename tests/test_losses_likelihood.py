@@ -85,6 +85,74 @@ def test_reported_kl_has_no_gradient():
         np.testing.assert_array_equal(gradient, np.zeros_like(post))
 
 
+batch_dynamics_loss = jax.jit(losses.batch_dynamics_loss, static_argnames=tuple(KL))
+
+
+def batch_gradients(post, prior, **numbers):
+    loss = lambda q, p: batch_dynamics_loss(q, p, **numbers)[0]  # noqa: E731
+    return jax.jit(jax.grad(loss, argnums=(0, 1)))(post, prior)
+
+
+@pytest.mark.parametrize("scale", [0.1, 3.0])
+@pytest.mark.parametrize("unimix", [0.01, 0.5])
+def test_batch_dynamics_loss_matches_its_twin(scale, unimix):
+    post, prior = logits(scale)
+    loss, kl = batch_dynamics_loss(post, prior, **KL | {"unimix": unimix})
+    twin = slow_kl(post, prior, unimix)
+    assert loss.shape == ()
+    np.testing.assert_allclose(kl, twin, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(loss, 1.1 * max(1, twin.mean()), rtol=1e-4)
+
+
+def far_off(state):
+    """Posteriors that are priors but in one state; its KL is about 3.2 nats."""
+    post = jnp.zeros((8, 32, 2))
+    return post.at[state, :, 0].set(0.9), jnp.zeros_like(post)
+
+
+def test_below_the_free_nats_of_a_batch_no_state_has_a_gradient_however_far_off_it_is():
+    post, prior = far_off(3)
+    loss, kl = batch_dynamics_loss(post, prior, **KL)
+    assert kl[3] > KL["free_nats"] > kl.mean()
+    np.testing.assert_allclose(loss, 1.1, rtol=1e-6)
+    for gradient in batch_gradients(post, prior, **KL):
+        np.testing.assert_array_equal(gradient, np.zeros_like(post))
+    # Of each state, DreamerV3's, the same free nats leave that state its gradient.
+    for gradient in gradients(post, prior, **KL):
+        assert (gradient[3] != 0).all()
+        np.testing.assert_array_equal(np.delete(gradient, 3, 0), 0.0)
+
+
+def test_above_the_free_nats_of_a_batch_every_state_has_its_gradient():
+    """That of the mean KL: also a state whose own KL is below has one."""
+    post, prior = logits(3.0)
+    post = post.at[0, 0].set(0.1 * post[0, 0])
+    prior = prior.at[0, 0].set(0.1 * prior[0, 0])
+    _, kl = batch_dynamics_loss(post, prior, **KL)
+    assert kl[0, 0] < KL["free_nats"] < kl.mean()
+    actual = batch_gradients(post, prior, **KL)
+    count = kl.size
+    expected = gradients(post, prior, **KL | {"free_nats": 0.0})
+    for a, e in zip(actual, expected, strict=True):
+        assert (np.abs(a[0, 0]) > 0).any()
+        np.testing.assert_allclose(a, e / count, rtol=1e-5, atol=1e-8)
+
+
+def test_each_term_of_the_batch_moves_its_own_side():
+    post, prior = logits(3.0)
+    to_post, to_prior = batch_gradients(post, prior, **KL | {"representation_scale": 0.0})
+    np.testing.assert_array_equal(to_post, np.zeros_like(post))
+    assert (np.abs(to_prior) > 0).any()
+    to_post, to_prior = batch_gradients(post, prior, **KL | {"dynamics_scale": 0.0})
+    np.testing.assert_array_equal(to_prior, np.zeros_like(prior))
+    assert (np.abs(to_post) > 0).any()
+
+
+def test_batch_dynamics_loss_refuses_a_prior_of_another_shape():
+    with pytest.raises(AssertionError):
+        batch_dynamics_loss(jnp.zeros((2, 3, 4, 5)), jnp.zeros((2, 1, 4, 5)), **KL)
+
+
 def test_dynamics_loss_is_finite_at_certainty():
     post, prior = 1e6 * jnp.eye(5)[:2].reshape(2, 1, 1, 5)
     loss, _ = dynamics_loss(post, prior, **KL)

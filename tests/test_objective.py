@@ -13,7 +13,7 @@ from test_nets import noisy
 from vawm import objective
 from vawm.agent import make_agent
 from vawm.config import ValueAlignmentConfig
-from vawm.types import Inference, Latent, Trajectory
+from vawm.types import Batch, Inference, Latent, Trajectory
 
 SPEC = tiny.env().spec
 BATCH, LENGTH = 2, 8
@@ -44,7 +44,7 @@ def batch(agent):
         is_terminal=flags,
         action=jax.random.normal(keys[2], (*shape, 1)),
     )
-    return objective.Batch(trajectory, agent.world_model.initial(BATCH))
+    return Batch(trajectory, agent.world_model.initial(BATCH))
 
 
 @functools.cache
@@ -54,28 +54,31 @@ def alignment_gradient(alignment):
     value_alignment = objective.make_value_alignment(agent, config)
 
     def loss(params):
-        data = batch(agent)
-        steps = jax.tree.map(lambda x: x[:, 1:], data.trajectory)
-        _, inference = agent.world_model.observe(
-            params.world_model,
-            jax.random.key(1),
-            data.context,
-            steps.obs,
-            data.trajectory.action[:, :-1],
-            steps.is_first,
-            train=True,
+        explanation, _ = agent.world_model.explain(
+            params.world_model, model_state(), jax.random.key(1), batch(agent)
         )
         kl = jnp.ones((BATCH, LENGTH))
-        aligned, weight, _ = value_alignment(params.critic, inference, kl, jnp.asarray(1))
+        aligned, weight, _ = value_alignment(
+            params.critic, explanation.inference, kl, jnp.asarray(1)
+        )
         return jnp.mean(aligned * weight), aligned
 
     return jax.jit(jax.grad(loss, has_aux=True))
 
 
 @functools.cache
-def params(zero_critic=False):
+def initial():
     agent, _ = make()
-    return (lambda x: x if zero_critic else noisy(x))(jax.jit(agent.init)(jax.random.key(0)))
+    return jax.jit(agent.init)(jax.random.key(0))
+
+
+def model_state():
+    return initial()[1]
+
+
+@functools.cache
+def params(zero_critic=False):
+    return (lambda x: x if zero_critic else noisy(x))(initial()[0])
 
 
 def norm(tree):
@@ -133,14 +136,13 @@ def test_the_weight_is_gated_by_the_warmup_and_follows_its_mode(alignment, step,
     deter, index = jnp.ones((*shape, 32)), jnp.zeros((*shape, 4), int)
     latents = [Latent(deter, jax.nn.one_hot(index + k, 4)) for k in (0, 1)]
     logits = jnp.zeros((*shape, 4, 4))
-    inference = Inference(*latents, logits, logits, jnp.ones(shape, bool).at[0, 0].set(False))
+    inference = Inference(*latents, logits, logits)
     value_alignment = jax.jit(objective.make_value_alignment(agent, config))
     aligned, weight, _ = value_alignment(
         params().critic, inference, jnp.full(shape, 3.0), jnp.asarray(step)
     )
-    assert weight[0, 0] == aligned[0, 0] == 0.0  # a state that nothing predicted
-    np.testing.assert_allclose(weight[1], expected, rtol=1e-6)
-    assert (aligned[1] > 0).all()  # logged whether or not it is used
+    np.testing.assert_allclose(weight, expected * np.ones(shape), rtol=1e-6)
+    assert (aligned > 0).all()  # logged whether or not it is used
 
 
 @functools.cache
@@ -153,9 +155,13 @@ def full_gradients(alignment, **critic):
     def losses(params, slow):
         data = batch(agent)
         keys = jax.random.split(jax.random.key(1))
-        first, inference, metrics = model_loss(params, slow, data, keys[0], jnp.asarray(1))
+        first, (inference, state, metrics) = model_loss(
+            params, model_state(), slow, data, keys[0], jnp.asarray(1)
+        )
         scale = objective.returns.init_return_scale()
-        second, _, more = behaviour_loss(params, slow, scale, data, inference, keys[1])
+        second, (_, more) = behaviour_loss(
+            params, state, slow, scale, data, inference, (), keys[1]
+        )
         return jnp.stack([first, second]), metrics | more
 
     slow = jax.tree.map(lambda x: x + 0.01, params().critic)
@@ -190,7 +196,7 @@ def products(alignment):
 
     def loss(params):
         data, key = batch(agent), jax.random.key(1)
-        return model_loss(params, params.critic, data, key, jnp.asarray(1))[0]
+        return model_loss(params, model_state(), params.critic, data, key, jnp.asarray(1))[0]
 
     hlo = jax.jit(jax.grad(loss)).lower(params()).compile().as_text()
     return hlo.count(" dot(") + hlo.count("dot_general")
@@ -213,9 +219,9 @@ def test_shared_noise_gives_no_loss_where_prior_equals_posterior():
         rssm["prior_net"] = heads["prior_net"] | {"heads_0": out}
         params = params._replace(world_model=params.world_model | {"rssm": rssm})
         key = jax.random.key(1)
-        metrics = objective.make_world_model_loss(agent, config)(
-            params, params.critic, batch(agent), key, jnp.asarray(1)
-        )[2]
+        _, (_, _, metrics) = objective.make_world_model_loss(agent, config)(
+            params, model_state(), params.critic, batch(agent), key, jnp.asarray(1)
+        )
         return metrics["value_alignment/loss"]
 
     assert aligned(params()) == 0.0
@@ -229,8 +235,9 @@ def test_what_is_logged_does_not_depend_on_scales_or_weight():
     for alignment in (ON, scaled, off):
         agent, config = make(alignment)
         loss = objective.make_world_model_loss(agent, config)
-        args = params(), params().critic, batch(agent), jax.random.key(1), jnp.asarray(1)
-        lines.append(jax.jit(loss)(*args)[2])
+        args = params(), model_state(), params().critic, batch(agent)
+        _, (_, _, metrics) = jax.jit(loss)(*args, jax.random.key(1), jnp.asarray(1))
+        lines.append(metrics)
     first = lines[0]
     ratio = first["value_alignment/loss"] / first["value_alignment/kl"]
     np.testing.assert_allclose(ratio, ON.dynamics_scale + ON.representation_scale, rtol=1e-5)

@@ -14,7 +14,7 @@ from test_returns import slow_lambda_returns, slow_replay_returns
 from vawm import objective, returns
 from vawm.config import ValueAlignmentConfig
 from vawm.learner import init_learner, make_update
-from vawm.types import Trajectory
+from vawm.types import Batch, Trajectory
 
 B, T, H = CONFIG.replay.batch_size, CONFIG.replay.batch_length, CONFIG.imagination.horizon
 DISCOUNT, LAMBDA = 1 - 1 / CONFIG.imagination.discount_horizon, CONFIG.imagination.lambda_
@@ -38,7 +38,7 @@ def batch():
         action=rng.normal(size=(*shape, 1)),
     )
     context = scalar_agent.latent(jnp.array([0.8, -1.2]), jnp.zeros(B))
-    return objective.Batch(jax.tree.map(jnp.asarray, trajectory), context)
+    return Batch(jax.tree.map(jnp.asarray, trajectory), context)
 
 
 def trajectory():
@@ -142,8 +142,8 @@ behaviour_loss = jax.jit(objective.make_behaviour_loss(AGENT, CONFIG))
 def behaviour(h, z, scale=(-2.0, 4.0)):
     inference = scalar_agent.inference(jnp.asarray(h), jnp.asarray(z))
     scale = returns.ReturnScale(*map(jnp.float32, scale))
-    _, scale, metrics = behaviour_loss(
-        PARAMS, jnp.float32(SLOW), scale, batch(), inference, jax.random.key(0)
+    _, (scale, metrics) = behaviour_loss(
+        PARAMS, (), jnp.float32(SLOW), scale, batch(), inference, (), jax.random.key(0)
     )
     return scale, metrics
 
@@ -178,8 +178,8 @@ def compiled_model_loss(critic="online"):
 
 
 def model_loss(critic="online", params=PARAMS):
-    _, inference, metrics = compiled_model_loss(critic)(
-        params, jnp.float32(SLOW), batch(), jax.random.key(0), jnp.asarray(1)
+    _, (inference, _, metrics) = compiled_model_loss(critic)(
+        params, (), jnp.float32(SLOW), batch(), jax.random.key(0), jnp.asarray(1)
     )
     return inference, metrics
 
@@ -234,7 +234,7 @@ def test_counted_in_updates_the_warmup_ignores_env_steps(updates, env_steps, ope
     learner = init_learner(AGENT, CONFIG, jax.random.key(0))
     learner = learner._replace(step=jnp.asarray(updates))
     _, _, metrics = compiled_update()(
-        learner, batch(), jax.random.key(0), jnp.asarray(env_steps)
+        learner, batch(), (), jax.random.key(0), jnp.asarray(env_steps)
     )
     assert (metrics["value_alignment/weight"] > 0) == opens
     assert (metrics["loss/value_alignment"] > 0) == opens

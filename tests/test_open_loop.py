@@ -8,9 +8,8 @@ import scalar_agent
 import tiny
 
 from vawm.agent import make_agent
-from vawm.objective import Batch
 from vawm.open_loop import make_open_loop
-from vawm.types import EnvSpec, Trajectory, image, vector
+from vawm.types import Batch, EnvSpec, Trajectory, image, vector
 
 BATCH, LENGTH, CONTEXT = 2, 6, 3
 
@@ -35,16 +34,16 @@ def batch(agent, seed=0, first=()):
     return Batch(trajectory, agent.world_model.initial(BATCH))
 
 
-def predict(agent, data, params):
+def predict(agent, data, params, state):
     open_loop = jax.jit(make_open_loop(agent, context=CONTEXT))
-    return open_loop(params, jax.random.key(1), data)
+    return open_loop(params, state, jax.random.key(1), data)
 
 
 def test_by_hand_on_the_scalar_agent():
     """h is filtered over the context, then follows the actions alone."""
     agent = scalar_agent.AGENT
     data = batch(agent)
-    actual = predict(agent, data, scalar_agent.PARAMS).predicted[..., 0]
+    actual = predict(agent, data, scalar_agent.PARAMS, ()).predicted[..., 0]
     obs, action = (np.asarray(x)[..., 0] for x in (data.trajectory.obs, data.trajectory.action))
     h = np.zeros(BATCH)
     for t in range(LENGTH):
@@ -56,15 +55,15 @@ def test_by_hand_on_the_scalar_agent():
 def mixed():
     spec = EnvSpec("test", {"a": image(48), "b": vector(2)}, 3, False, 2, 1, None)
     agent = make_agent(tiny.CONFIG, spec)
-    params = agent.init(jax.random.key(0))
+    params, state = agent.init(jax.random.key(0))
     # So that samples of z follow what is seen, and not their noise alone.
     out = params.world_model["rssm"]["posterior_out"]
     params.world_model["rssm"]["posterior_out"] = jax.tree.map(lambda x: 100 * x, out)
-    return agent, params
+    return agent, params, state
 
 
 def test_what_comes_after_the_context_is_never_looked_at(mixed):
-    agent, params = mixed
+    agent, *needed = mixed
     data, other = batch(agent), batch(agent, seed=1)
     seen = jax.tree.map(
         lambda x, y: x.at[:, CONTEXT + 1 :].set(y[:, CONTEXT + 1 :]),
@@ -74,8 +73,8 @@ def test_what_comes_after_the_context_is_never_looked_at(mixed):
     same = Batch(data.trajectory._replace(obs=seen), data.context)
     jax.tree.map(
         np.testing.assert_array_equal,
-        predict(agent, data, params),
-        predict(agent, same, params),
+        predict(agent, data, *needed),
+        predict(agent, same, *needed),
     )
     early = jax.tree.map(
         lambda x, y: x.at[:, CONTEXT].set(y[:, CONTEXT]),
@@ -83,21 +82,21 @@ def test_what_comes_after_the_context_is_never_looked_at(mixed):
         other.trajectory.obs,
     )
     changed = Batch(data.trajectory._replace(obs=early), data.context)
-    first, second = (predict(agent, d, params).predicted["a"] for d in (data, changed))
+    first, second = (predict(agent, d, *needed).predicted["a"] for d in (data, changed))
     assert (first[:, CONTEXT - 1 :] != second[:, CONTEXT - 1 :]).any((2, 3, 4)).any(1).all()
     np.testing.assert_array_equal(first[:, : CONTEXT - 1], second[:, : CONTEXT - 1])
 
 
 def test_predictions_have_the_tree_and_the_shapes_of_what_is_predicted(mixed):
-    agent, params = mixed
-    predicted = predict(agent, batch(agent), params).predicted
+    agent, *needed = mixed
+    predicted = predict(agent, batch(agent), *needed).predicted
     assert predicted["a"].shape == (BATCH, LENGTH, 48, 48, 3)
     assert predicted["b"].shape == (BATCH, LENGTH, 2)
 
 
 def test_steps_after_a_reset_are_marked(mixed):
-    agent, params = mixed
+    agent, *needed = mixed
     # Flags of the trajectory, whose first step only gives context.
     data = batch(agent, first=[(0, 2), (1, 5)])
     expected = [[False] + [True] * 5, [True] * 4 + [False] * 2]
-    np.testing.assert_array_equal(predict(agent, data, params).same_episode, expected)
+    np.testing.assert_array_equal(predict(agent, data, *needed).same_episode, expected)

@@ -1,4 +1,4 @@
-"""LaProp and adaptive gradient clipping against float64 numpy, and by hand."""
+"""LaProp, adaptive gradient clipping and clipped Adam against float64 numpy, and by hand."""
 
 import dataclasses
 
@@ -9,9 +9,9 @@ import optax
 import pytest
 
 from vawm import optim
-from vawm.config import OptimizerConfig
+from vawm.config import AdamConfig, LaPropConfig
 
-CONFIG = OptimizerConfig()
+CONFIG = LaPropConfig()
 
 
 def slow_laprop(gradients, rate, beta1, beta2, eps):
@@ -88,7 +88,7 @@ def test_clip_refuses_to_work_without_parameters():
 def test_learning_rate_rises_from_zero_and_stays():
     config = dataclasses.replace(CONFIG, warmup_updates=4)
     gradients = [jnp.array([1e-5, -1e-5])] * 7
-    updates = run(optim.make_optimizer(config), jnp.ones(2), gradients)
+    updates = run(optim.make_laprop(config), jnp.ones(2), gradients)
     rates = [-float(update[0]) for update in updates]
     expected = config.learning_rate * np.array([0, 0.25, 0.5, 0.75, 1, 1, 1])
     np.testing.assert_allclose(rates, expected, rtol=1e-4)
@@ -97,7 +97,7 @@ def test_learning_rate_rises_from_zero_and_stays():
 
 def test_no_warm_up_is_the_full_rate_at_once():
     config = dataclasses.replace(CONFIG, warmup_updates=0)
-    (update,) = run(optim.make_optimizer(config), jnp.ones(1), [jnp.array([0.1])])
+    (update,) = run(optim.make_laprop(config), jnp.ones(1), [jnp.array([0.1])])
     np.testing.assert_allclose(update, [-config.learning_rate], rtol=1e-5)
 
 
@@ -110,7 +110,7 @@ def test_optimizer_matches_float64_with_clipping_and_warm_up():
         for _ in range(20)
     ]
     as_float32 = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), (params, gradients))
-    actual = run(optim.make_optimizer(config), *as_float32)
+    actual = run(optim.make_laprop(config), *as_float32)
     for name, value in params.items():
         limit = config.agc * max(config.agc_floor, np.linalg.norm(value))
         clipped = [g[name] / max(1, np.linalg.norm(g[name]) / limit) for g in gradients]
@@ -122,7 +122,7 @@ def test_optimizer_matches_float64_with_clipping_and_warm_up():
 
 def test_a_tensor_without_gradient_never_moves():
     params = {"still": jnp.array([1.0, 0.0]), "moved": jnp.array([1.0])}
-    optimizer = optim.make_optimizer(dataclasses.replace(CONFIG, warmup_updates=0))
+    optimizer = optim.make_laprop(dataclasses.replace(CONFIG, warmup_updates=0))
     gradient = {"still": jnp.zeros(2), "moved": jnp.ones(1)}
     state = optimizer.init(params)
     for _ in range(5):
@@ -130,3 +130,70 @@ def test_a_tensor_without_gradient_never_moves():
         params = optax.apply_updates(params, updates)
     np.testing.assert_array_equal(params["still"], [1.0, 0.0])
     assert params["moved"] < 1.0
+
+
+def slow_adam(gradients, rate, clip, eps, config):
+    """The updates of a tree at every step, clipped as `torch.nn.utils.clip_grad_norm_` does."""
+    m, v, updates = dict.fromkeys(gradients[0], 0.0), dict.fromkeys(gradients[0], 0.0), []
+    for t, tree in enumerate(gradients, start=1):
+        norm = np.sqrt(sum(np.square(g).sum() for g in tree.values()))
+        g = {name: x * min(1.0, clip / (norm + 1e-6)) for name, x in tree.items()}
+        update = {}
+        for k, x in g.items():
+            m[k] = config.beta1 * m[k] + (1 - config.beta1) * x
+            v[k] = config.beta2 * v[k] + (1 - config.beta2) * x**2
+            mean, square = m[k] / (1 - config.beta1**t), v[k] / (1 - config.beta2**t)
+            update[k] = -rate * mean / (np.sqrt(square) + eps)
+        updates.append(update)
+    return updates
+
+
+@pytest.mark.parametrize("size", [0.01, 1.0, 30.0])
+def test_adams_match_float64_whether_or_not_they_clip(size):
+    """An epsilon as large as a gradient shows what clipping does, which Adam else undoes."""
+    config = AdamConfig(
+        learning_rate=0.01,
+        clip=2.0,
+        epsilon=0.1,
+        behaviour_learning_rate=0.02,
+        behaviour_clip=0.5,
+        behaviour_epsilon=1.0,
+    )
+    rng = np.random.default_rng(0)
+    gradients = [
+        {"kernel": size * rng.normal(size=(4, 3)), "bias": size * rng.normal(size=3)}
+        for _ in range(3)
+    ]
+    norms = [np.sqrt(sum(np.square(g).sum() for g in tree.values())) for tree in gradients]
+    assert (max(norms) < config.behaviour_clip) == (size == 0.01)
+    as_float32 = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), gradients)
+    adams = optim.make_adams(config)
+    for adam, numbers in [
+        (adams.world_model, (0.01, 2.0, 0.1)),
+        (adams.behaviour, (0.02, 0.5, 1.0)),
+    ]:
+        actual = run(adam, jax.tree.map(jnp.zeros_like, as_float32[0]), as_float32)
+        twin = slow_adam(gradients, *numbers, config)
+        for update, expected in zip(actual, twin, strict=True):
+            for name in expected:
+                np.testing.assert_allclose(update[name], expected[name], rtol=2e-5)
+
+
+def test_each_adam_moves_at_a_rate_of_its_own_from_the_first_step_on():
+    config, gradient = AdamConfig(), [jnp.array([3.0, -0.2])]
+    adams = optim.make_adams(config)
+    for adam, rate in [
+        (adams.world_model, config.learning_rate),
+        (adams.behaviour, config.behaviour_learning_rate),
+    ]:
+        (update,) = run(adam, jnp.zeros(2), gradient)
+        np.testing.assert_allclose(update, [-rate, rate], rtol=1e-3)
+
+
+def test_actor_and_critic_are_clipped_together():
+    """Norms 3 and 4, 5 in all: either alone would be left as it is."""
+    config = AdamConfig(behaviour_clip=4.0, behaviour_epsilon=1e6, behaviour_learning_rate=1e6)
+    gradient = (jnp.array([3.0]), jnp.array([4.0]))
+    zeros = jax.tree.map(jnp.zeros_like, gradient)
+    ((actor, critic),) = run(optim.make_adams(config).behaviour, zeros, [gradient])
+    np.testing.assert_allclose([actor[0], critic[0]], [-3.0 * 0.8, -4.0 * 0.8], rtol=1e-4)

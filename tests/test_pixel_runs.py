@@ -1,4 +1,4 @@
-"""Real runs at tiny size: one game of Atari and one task of DMC vision, 2,000 steps each."""
+"""Real runs at tiny size, 2,000 steps each: games of Atari and a task of DMC vision."""
 
 import dataclasses
 import json
@@ -8,6 +8,7 @@ import jax
 import pytest
 import runs
 import tiny
+import tiny_storm
 
 from vawm import config as config_lib
 from vawm import evaluate, policy, presets, runner, suites, tracking
@@ -31,7 +32,7 @@ def tiny_version(config, **changes):
         critic=tiny.CONFIG.critic,
         imagination=tiny.CONFIG.imagination,
         value_alignment=config_lib.ValueAlignmentConfig(warmup_steps=STEPS // 2),
-        optimizer=config_lib.OptimizerConfig(learning_rate=1e-3, warmup_updates=10),
+        optimizer=config_lib.LaPropConfig(learning_rate=1e-3, warmup_updates=10),
         replay=config_lib.ReplayConfig(capacity=STEPS, batch_size=4, batch_length=16),
         video=dataclasses.replace(
             config.video, every=STEPS * config.action_repeat // 2, sequences=2
@@ -40,16 +41,21 @@ def tiny_version(config, **changes):
     )
 
 
+STORM = presets.PRESETS["storm"]["atari100k"]["quick"]
 CONFIGS = {
     "atari100k": tiny_version(presets.ATARI_QUICK, task="breakout"),
     "dmc_vision": tiny_version(presets.VISION_QUICK, task="cartpole_balance", num_envs=2),
+    "atari100k_storm": tiny_storm.storm(
+        tiny_version(STORM, task="kung_fu_master", random_steps=STEPS // 4),
+        world_model=tiny_storm.model(depth=4),
+    ),
 }
 
 
 @pytest.fixture(scope="module", params=CONFIGS)
 def run(request, tmp_path_factory):
     """The folder of a whole run, and its config."""
-    if request.param == "atari100k":
+    if request.param.startswith("atari100k"):
         pytest.importorskip("ale_py")
     if request.param == "dmc_vision" and rendering.fault("egl") and rendering.fault("osmesa"):
         pytest.skip(rendering.fault("egl"))

@@ -43,12 +43,12 @@ def length_of(seed):
 def policy(spec, action=0.0, seen=None):
     """Always the same action; notes how it is asked."""
 
-    def apply(params, key, carry, timestep, how):
+    def apply(params, state, key, carry, timestep, how):
         if seen is not None:
             seen.append(how)
         return carry + 1, jnp.full((carry.shape[0], 1), action)
 
-    return Policy(tiny_pixels.CONFIG, spec, 0, None, lambda n: jnp.zeros(n), apply)
+    return Policy(tiny_pixels.CONFIG, spec, 0, None, None, lambda n: jnp.zeros(n), apply)
 
 
 @pytest.fixture(scope="module", params=[1, 3])

@@ -122,3 +122,16 @@ def test_capacity_is_shared_by_environments_and_bounded_by_the_run():
     assert capacity(1000) == 51  # 1000 / (4 * 5) calls and one reset
     assert capacity(4000) == 202  # a second reset after 200 calls
     assert capacity(1000, collect_steps=20) == 60
+
+
+def test_without_latents_a_sample_has_no_context_and_nothing_is_written_back():
+    trajectory, _ = steps(2, 0, 5)
+    buffer = replay.init(first_step(trajectory), (), capacity=7)
+    buffer = replay.add(buffer, trajectory, ())
+    positions = replay.draw(buffer, jax.random.key(5), batch_size=3, length=4)
+    read, context = replay.read(buffer, positions, classes=CLASSES)
+    assert context == buffer.latent == ()
+    assert (np.diff(read.reward, axis=1) == 1).all()
+    jax.tree.map(
+        np.testing.assert_array_equal, replay.write_back(buffer, positions, ()), buffer
+    )

@@ -46,6 +46,30 @@ def test_lambda_returns_match_the_recursion(shape, lambda_):
     np.testing.assert_allclose(actual, twin, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.parametrize("shape", [(5,), (5, 3), (1, 2)])
+@pytest.mark.parametrize("lambda_", [0.0, 0.95, 1.0])
+def test_lambda_returns_of_current_values_match_the_recursion(shape, lambda_):
+    """STORM's official code: R_t = r + d ((1 - l) v_t + l R_{t+1}), R_H = v_H."""
+    rng = np.random.default_rng(0)
+    reward, discount = rng.normal(size=shape), rng.uniform(size=shape)
+    value = rng.normal(size=(shape[0] + 1, *shape[1:]))
+    as_float32 = (jnp.asarray(x, jnp.float32) for x in (reward, discount, value[:-1]))
+    bootstrap = jnp.asarray(value[-1], jnp.float32)
+    actual = returns.lambda_returns(*as_float32, bootstrap, lambda_=lambda_)
+    twin, following = np.zeros(shape), value[-1]
+    for t in reversed(range(shape[0])):
+        mixed = (1 - lambda_) * value[t] + lambda_ * following
+        twin[t] = following = reward[t] + discount[t] * mixed
+    np.testing.assert_allclose(actual, twin, rtol=1e-5, atol=1e-6)
+
+
+def test_a_last_value_as_bootstrap_changes_nothing():
+    reward, discount, value = jax.random.uniform(jax.random.key(0), (3, 5, 2))
+    usual = returns.lambda_returns(reward, discount, value, lambda_=0.9)
+    given = returns.lambda_returns(reward, discount, value, value[-1], lambda_=0.9)
+    np.testing.assert_array_equal(given, usual)
+
+
 def test_lambda_returns_stop_at_a_terminal_state():
     reward = jnp.array([1.0, 10.0, 100.0])
     discount = jnp.array([1.0, 0.0, 1.0])  # s_2 is terminal

@@ -46,8 +46,8 @@ def assert_close(actual, expected):
 
 def check_update(update, learner, data):
     arguments = jax.random.key(1), jnp.asarray(1000)
-    expected = update(learner, data, *arguments)
-    actual = update(put(learner), put(data, "data"), *arguments)
+    expected = update(learner, data, (), *arguments)
+    actual = update(put(learner), put(data, "data"), (), *arguments)
     assert not actual[1].deter.sharding.is_fully_replicated
     # Squared gradients: the first update is but their sign.
     squares = (optax.tree.get(after[0].opt_state, "nu") for after in (actual, expected))
@@ -56,9 +56,14 @@ def check_update(update, learner, data):
 
 
 def check_collect(collect, state):
-    params, key = state.learner.params, jax.random.key(1)
-    expected = collect(params, state.collector, state.replay, key)
-    actual = collect(put(params), put(state.collector, "data"), put(state.replay, "data"), key)
+    params, model_state = state.learner.params, state.learner.model_state
+    key = jax.random.key(1)
+    expected = collect(params, model_state, state.collector, state.replay, key)
+    actual = collect(
+        *put((params, model_state)),
+        *put((state.collector, state.replay), "data"),
+        key,
+    )
     assert not actual[1].trajectory.obs.sharding.is_fully_replicated
     assert_close(actual[1:], expected[1:])
 

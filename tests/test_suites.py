@@ -45,15 +45,18 @@ def experiment(monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize("suite", PROGRAMS)
-def test_every_program_runs_its_suite_and_says_what_its_preset_is(experiment, suite, capsys):
-    assert experiment(suite) == 0
+@pytest.mark.parametrize("agent", presets.PRESETS)
+def test_every_program_runs_its_suite_and_says_what_its_preset_is(
+    experiment, suite, agent, capsys
+):
+    assert experiment(suite, *([] if agent == "dreamerv3" else ["--agent", agent])) == 0
     config, logdir = experiment.seen[0]
-    assert config == presets.PRESETS[suite]["quick"]
+    assert config == presets.PRESETS[agent][suite]["quick"]
     assert logdir.parts[:2] == ("runs", suite)
     text = capsys.readouterr().out
-    assert f"preset quick: {suite} {config.task}, " in text
+    assert f"{agent}, preset quick: {suite} {config.task}, " in text
     assert "for a CPU with 2 cores; this is not the paper's setting" in text
-    assert ("--preset paper" in text) == ("paper" in presets.PRESETS[suite])
+    assert ("--preset paper" in text) == ("paper" in presets.PRESETS[agent][suite])
 
 
 @pytest.mark.parametrize("flag", [["--game", "krull"], ["--game=krull"], ["--task", "krull"]])
@@ -82,7 +85,7 @@ def test_presets_of_pixels_and_of_the_paper_can_be_named(experiment):
         ("atari100k", ["--game", "brekout"], "game='brekout': did you mean 'breakout'?"),
         ("atari100k", ["--env.stiky", "1"], "--env.stiky='1': no such flag; did you mean"),
         ("atari100k", ["--env.sticky", "2"], "env.sticky=2.0: use a number from 0 up to"),
-        ("atari100k", ["--agent", "strom"], "--agent='strom': use one of dreamerv3"),
+        ("atari100k", ["--agent", "strom"], "agent='strom': did you mean 'storm'? use"),
         ("dmc_vision", ["--task", "humanoid_run"], "task='humanoid_run': "),
         ("dmc_vision", ["--env.image-size", "84"], "env.image_size=84: use a multiple of 16"),
         ("dmc_vision", ["--env.renderer", "glx"], "--env.renderer='glx': did you mean 'egl'"),

@@ -12,7 +12,8 @@ import tiny
 
 from vawm import envs, replay, train
 from vawm.agent import make_agent
-from vawm.learner import init_learner, make_learn
+from vawm.learn import make_learn
+from vawm.learner import init_learner
 from vawm.types import Trajectory
 
 

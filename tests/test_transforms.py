@@ -291,3 +291,61 @@ def test_categorical_entropy_matches_its_sum_and_is_known_at_the_ends():
     np.testing.assert_allclose(
         transforms.categorical_entropy(ends), [np.log(4), 0.0], rtol=1e-6, atol=1e-7
     )
+
+
+def numbers():
+    """What both codes can tell apart in float32: small, ordinary and huge, of both signs."""
+    y = np.array([0.0, 1e-3, 0.4, 1.0, 7.3, 250.0, 1e5, 4e8], np.float32)
+    return jnp.asarray(np.concatenate([-y[::-1], y]))
+
+
+@pytest.mark.parametrize("spacing", ["symexp", "symlog"])
+@pytest.mark.parametrize("n", [41, 255])
+def test_a_code_decodes_what_it_encodes(spacing, n):
+    code = transforms.make_two_hot(n, spacing)
+    share = two_hot(code.encode(numbers()), code.bins)
+    # Where a share is 0 its logarithm is not finite; exp(-1e4) is 0 too.
+    logits = jnp.where(share > 0, jnp.log(jnp.maximum(share, 1e-37)), -1e4)
+    np.testing.assert_allclose(jax.jit(code.mean)(logits), numbers(), rtol=1e-3, atol=1e-5)
+
+
+def test_the_symexp_code_is_the_one_of_values():
+    code = transforms.make_two_hot(41, "symexp")
+    logits = jax.random.normal(jax.random.key(0), (3, 41))
+    np.testing.assert_array_equal(code.bins, transforms.symexp_bins(41))
+    np.testing.assert_array_equal(code.encode(numbers()), numbers())
+    np.testing.assert_array_equal(code.mean(logits), transforms.two_hot_mean(logits, code.bins))
+
+
+@pytest.mark.parametrize("n", [3, 41, 255])
+@pytest.mark.parametrize("shape", [(), (3,), (2, 3)])
+def test_the_symlog_code_matches_its_twin(n, shape):
+    code = transforms.make_two_hot(n, "symlog")
+    bins = np.linspace(-20, 20, n)
+    np.testing.assert_allclose(code.bins, bins, rtol=1e-6, atol=1e-6)
+    y = np.asarray(numbers(), np.float64)
+    twin = np.sign(y) * np.log1p(np.abs(y))
+    np.testing.assert_allclose(code.encode(numbers()), twin, rtol=1e-6)
+
+    logits = 3 * jax.random.normal(jax.random.key(0), (*shape, n))
+    mean_symlog = np.exp(slow_log_softmax(logits)) @ bins
+    twin = np.sign(mean_symlog) * np.expm1(np.abs(mean_symlog))
+    actual = code.mean(logits)
+    assert actual.shape == shape
+    np.testing.assert_allclose(actual, twin, rtol=1e-4, atol=1e-5)
+
+
+def test_where_classes_disagree_the_symlog_code_is_nearer_to_zero():
+    """Even odds of 0 and of symexp(20), by hand."""
+    logits = jnp.full(41, -1e4).at[jnp.array([20, 40])].set(0.0)
+    values, symlogs = (
+        transforms.make_two_hot(41, spacing).mean(logits) for spacing in ("symexp", "symlog")
+    )
+    np.testing.assert_allclose(values, np.expm1(20.0) / 2, rtol=1e-5)
+    np.testing.assert_allclose(symlogs, np.expm1(10.0), rtol=1e-5)
+
+
+def test_the_mean_of_a_symlog_code_is_float32_whatever_the_logits_are():
+    actual = transforms.make_two_hot(41, "symlog").mean(jnp.zeros((2, 41), jnp.bfloat16))
+    assert actual.dtype == jnp.float32
+    np.testing.assert_allclose(actual, [0.0, 0.0], atol=1e-5)

@@ -16,7 +16,8 @@ def numbers(config):
     return [name for name, _, kind in validate.fields(config) if kind in (int, float)]
 
 
-NUMBERS = numbers(tiny.CONFIG)
+STORM = presets.STORM_QUICK
+NUMBERS = [(config, name) for config in (tiny.CONFIG, STORM) for name in numbers(config)]
 
 
 def changed(name, value, config=tiny.CONFIG):
@@ -27,21 +28,34 @@ def changed(name, value, config=tiny.CONFIG):
     return dataclasses.replace(config, **{head: value})
 
 
-PRESETS = [(suite, name) for suite, own in presets.PRESETS.items() for name in own]
+PRESETS = [
+    (agent, suite, name)
+    for agent, suites in presets.PRESETS.items()
+    for suite, own in suites.items()
+    for name in own
+]
+AT_EVERY_SIZE = [(*preset, size) for preset in PRESETS for size in config_lib.SIZES[preset[0]]]
 
 
-@pytest.mark.parametrize(("suite", "preset"), PRESETS)
-@pytest.mark.parametrize("size", config_lib.SIZES)
-def test_every_preset_is_valid_at_every_size(suite, preset, size):
-    config = validate.preset(suite, preset, size)
+@pytest.mark.parametrize(("agent", "suite", "preset", "size"), AT_EVERY_SIZE)
+def test_every_preset_is_valid_at_every_size(agent, suite, preset, size):
+    config = validate.preset(agent, suite, preset, size)
     validate.check(config)
-    assert (config.suite, config.preset, config.size) == (suite, preset, size)
+    chosen = config.agent, config.suite, config.preset, config.size
+    assert chosen == (agent, suite, preset, size)
 
 
-@pytest.mark.parametrize("name", NUMBERS)
+@pytest.mark.parametrize(("agent", "suite", "preset"), PRESETS)
+def test_every_preset_has_a_size_of_its_own_agent(agent, suite, preset):
+    config = validate.preset(agent, suite, preset)
+    validate.check(config)
+    assert config == config_lib.with_size(config, config.size)
+
+
+@pytest.mark.parametrize(("config", "name"), NUMBERS, ids=lambda x: getattr(x, "agent", x))
 @pytest.mark.parametrize("value", [-1, math.nan, math.inf, True, "3"])
-def test_every_number_is_checked(name, value):
-    assert_refused(tiny.CONFIG, name, value)
+def test_every_number_is_checked(config, name, value):
+    assert_refused(config, name, value)
 
 
 def assert_refused(config, name, value):
@@ -52,20 +66,27 @@ def assert_refused(config, name, value):
     assert "\n" not in str(error.value)
 
 
-def quick(suite):
-    return presets.PRESETS[suite]["quick"]
+def quick(suite, agent="dreamerv3"):
+    return presets.PRESETS[agent][suite]["quick"]
 
 
+@pytest.mark.parametrize("agent", presets.PRESETS)
 @pytest.mark.parametrize("suite", config_lib.ENV_CONFIGS)
-def test_every_number_of_an_environment_is_checked(suite):
-    for name in numbers(quick(suite)):
+def test_every_number_of_an_environment_is_checked(suite, agent):
+    for name in numbers(quick(suite, agent)):
         if name.startswith("env."):
             for value in (-2, math.nan, True, "3"):
-                assert_refused(quick(suite), name, value)
+                assert_refused(quick(suite, agent), name, value)
 
 
 def test_every_rule_is_about_a_field():
-    names = set().union(*(numbers(quick(suite)) for suite in presets.PRESETS))
+    names = set().union(
+        *(
+            numbers(quick(suite, agent))
+            for agent, own in presets.PRESETS.items()
+            for suite in own
+        )
+    )
     assert set(validate.RULES) <= names
 
 
@@ -119,9 +140,9 @@ def test_the_smallest_value_that_is_named_is_accepted(name, value):
     validate.check(changed(name, value))
 
 
-@pytest.mark.parametrize(("suite", "preset"), PRESETS)
-def test_a_batch_larger_than_replay_is_blamed_and_a_smaller_one_named(suite, preset):
-    config = presets.PRESETS[suite][preset]
+@pytest.mark.parametrize(("agent", "suite", "preset"), PRESETS)
+def test_a_batch_larger_than_replay_is_blamed_and_a_smaller_one_named(agent, suite, preset):
+    config = presets.PRESETS[agent][suite][preset]
     with pytest.raises(InvalidInput, match="does not fit into") as error:
         validate.check(changed("replay.batch_size", 100_000, config))
     assert error.value.field == "replay.batch_size"
@@ -144,6 +165,8 @@ QUICK = presets.QUICK
         (changed("size", "12", QUICK), "size='12': did you mean '12m'"),
         (changed("preset", "bogus"), "preset='bogus': use one of quick, paper, custom"),
         (changed("preset", "tiny"), "preset='tiny': "),
+        (changed("size", "12m", STORM), "size='12m': did you mean '1m'"),
+        (changed("preset", "paper", STORM), "preset='paper': use one of quick, custom"),
     ],
 )
 def test_a_config_of_no_known_size_or_preset_is_refused(config, message):
@@ -162,6 +185,15 @@ def test_a_config_of_no_known_size_or_preset_is_refused(config, message):
         (changed("world_model.depth", 8, QUICK), "world_model.depth=4, not 8"),
         (changed("actor.units", 65, QUICK), "actor.units=64, not 65"),
         (changed("critic.units", 65, QUICK), "critic.units=64, not 65"),
+        (changed("size", "16m", STORM), "world_model.deter=512, not 128"),
+        (changed("world_model.deter", 64, STORM), "world_model.deter=128, not 64"),
+        (changed("world_model.feedforward", 64, STORM), "world_model.feedforward=256, not 64"),
+        (changed("world_model.heads", 8, STORM), "world_model.heads=4, not 8"),
+        (changed("world_model.classes", 5, STORM), "world_model.classes=8, not 5"),
+        (changed("world_model.units", 65, STORM), "world_model.units=128, not 65"),
+        (changed("world_model.depth", 4, STORM), "world_model.depth=8, not 4"),
+        (changed("actor.units", 65, STORM), "actor.units=128, not 65"),
+        (changed("critic.units", 65, STORM), "critic.units=128, not 65"),
     ],
 )
 def test_a_size_with_widths_of_another_is_refused(config, width):
@@ -174,11 +206,96 @@ def test_a_size_with_widths_of_another_is_refused(config, width):
 
 def test_unknown_presets_and_sizes_come_with_a_suggestion():
     with pytest.raises(InvalidInput, match="preset='papr': did you mean 'paper'"):
-        validate.preset("dmc_proprio", "papr")
+        validate.preset("dreamerv3", "dmc_proprio", "papr")
     with pytest.raises(InvalidInput, match="size='12': did you mean '12m'"):
-        validate.preset("dmc_proprio", "quick", "12")
+        validate.preset("dreamerv3", "dmc_proprio", "quick", "12")
     with pytest.raises(InvalidInput, match="suite='atari': did you mean 'atari100k'"):
-        validate.preset("atari", "quick")
+        validate.preset("dreamerv3", "atari", "quick")
+    with pytest.raises(InvalidInput, match="agent='strom': did you mean 'storm'"):
+        validate.preset("strom", "dmc_proprio", "quick")
+    with pytest.raises(InvalidInput, match="size='12m': did you mean '1m'"):
+        validate.preset("storm", "dmc_proprio", "quick", "12m")
+    with pytest.raises(InvalidInput, match="preset='paper': use one of quick"):
+        validate.preset("storm", "dmc_proprio", "paper")
+
+
+FROM_CONTEXTS = changed("imagination.starts", "contexts")
+CUSTOM_STORM = changed("size", "custom", STORM)
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        (changed("agent", "strom"), "agent='strom': did you mean 'storm'"),
+        (
+            changed("agent", "storm"),
+            "world_model='RSSMConfig': agent storm takes a StormConfig",
+        ),
+        (
+            changed("agent", "dreamerv3", STORM),
+            "world_model='StormConfig': agent dreamerv3 takes a RSSMConfig",
+        ),
+        (
+            changed("optimizer", config_lib.LaPropConfig(), STORM),
+            "optimizer='LaPropConfig': agent storm takes a AdamConfig",
+        ),
+        (
+            changed("optimizer", config_lib.AdamConfig()),
+            "optimizer='AdamConfig': agent dreamerv3 takes a LaPropConfig",
+        ),
+        (
+            changed("critic.replay_scale", 0.3, STORM),
+            "critic.replay_scale=0.3: use 0: its returns begin at posteriors",
+        ),
+        (FROM_CONTEXTS, "critic.replay_scale=0.3: use 0: "),
+        (
+            changed("imagination.context_length", 33, STORM),
+            "imagination.context_length=33: use at most replay.batch_length=32",
+        ),
+        (
+            changed("imagination.starts", "posteriors", STORM),
+            "imagination.starts='posteriors': use contexts: a transformer has no state",
+        ),
+        (
+            changed("world_model.positions", 31, STORM),
+            "replay.batch_length=32: a sequence of 32 has no position in the transformer: "
+            "use less, or more world_model.positions than 31",
+        ),
+        (
+            changed("world_model.act_context", 65, STORM),
+            "world_model.act_context=65: a sequence of 65 has no position",
+        ),
+        (
+            changed("imagination.horizon", 57, STORM),
+            "imagination.horizon=57: a sequence of 65 after 8 of context has no position",
+        ),
+        (
+            changed("world_model.deter", 126, CUSTOM_STORM),
+            "world_model.deter=126: use a multiple of world_model.heads=4",
+        ),
+        (changed("world_model.dropout", 1.0, STORM), "world_model.dropout=1.0: use a number"),
+        (changed("random_steps", -1), "random_steps=-1: use 0 or a number above"),
+    ],
+)
+def test_what_an_agent_cannot_do_is_refused(config, message):
+    with pytest.raises(InvalidInput, match=message):
+        validate.check(config)
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        changed("world_model.positions", 32, STORM),
+        changed("world_model.act_context", 64, STORM),
+        changed("imagination.horizon", 56, STORM),
+        changed("imagination.context_length", 32, STORM),
+        changed("world_model.deter", 124, CUSTOM_STORM),
+        # A recurrent model can follow a context too.
+        changed("critic.replay_scale", 0.0, FROM_CONTEXTS),
+    ],
+)
+def test_what_an_agent_can_just_do_is_accepted(config):
+    validate.check(config)
 
 
 ATARI, VISION = quick("atari100k"), quick("dmc_vision")

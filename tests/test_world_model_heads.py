@@ -23,7 +23,9 @@ def spec(obs):
 
 def make(obs):
     heads = make_heads(CONFIG, spec(obs), jnp.float32)
-    return heads, heads.init(jax.random.key(0))
+    params, state = heads.init(jax.random.key(0))
+    assert not jax.tree.leaves(state)  # nothing is carried
+    return heads, params, state
 
 
 def random_obs(obs, seed=0):
@@ -48,23 +50,23 @@ def latent():
 
 @pytest.mark.parametrize("size", [48, 64, 96, 128])
 def test_square_images_of_several_sizes_are_read_and_predicted(size):
-    heads, params = make(image(size))
-    tokens = heads.encode(params, random_obs(image(size)))
+    heads, params, state = make(image(size))
+    tokens = heads.encode(params, state, random_obs(image(size)))
     assert tokens.shape == (*LEADING, heads.token_size)
     assert heads.token_size == (size // 16) ** 2 * 4 * CONFIG.depth
-    predicted = heads.predict(params, latent()).obs
+    predicted = heads.predict(params, state, latent()).obs
     assert predicted.shape == (*LEADING, size, size, 3)
     assert ((predicted > 0) & (predicted < 1)).all()
 
 
 def test_images_are_read_as_bytes_between_minus_and_plus_a_half():
-    heads, params = make(image(64))
+    heads, params, state = make(image(64))
     obs = random_obs(image(64))
     pixels = np.asarray(obs, np.float32).reshape(6, 64, 64, 3) / 255 - 0.5
     cnn = nets.ImageEncoder(3, CONFIG.depth)
     expected = cnn.apply({"params": params["encoder"]["image"]}, pixels)
     np.testing.assert_allclose(
-        heads.encode(params, obs).reshape(6, -1), expected, rtol=1e-5, atol=1e-6
+        heads.encode(params, state, obs).reshape(6, -1), expected, rtol=1e-5, atol=1e-6
     )
 
 
@@ -72,15 +74,15 @@ MIXED = {"camera": image(48), "joints": vector(4), "speed": vector(2), "top": im
 
 
 def test_images_and_vectors_are_mixed_and_each_is_predicted_at_its_place():
-    heads, params = make(MIXED)
+    heads, params, state = make(MIXED)
     obs = random_obs(MIXED)
-    tokens = heads.encode(params, obs)
+    tokens = heads.encode(params, state, obs)
     assert heads.token_size == CONFIG.units + 3 * 3 * 4 * CONFIG.depth
-    predicted = heads.predict(params, latent()).obs
+    predicted = heads.predict(params, state, latent()).obs
     assert {k: x.shape for k, x in predicted.items()} == {k: x.shape for k, x in obs.items()}
     read = {"joints": slice(None, CONFIG.units), "top": slice(CONFIG.units, None)}
     for name, changed in read.items():
-        other = heads.encode(params, obs | {name: random_obs(MIXED, seed=1)[name]})
+        other = heads.encode(params, state, obs | {name: random_obs(MIXED, seed=1)[name]})
         same = np.asarray(tokens == other)
         assert not same[..., changed].all()
         rest = np.ones(heads.token_size, bool)
@@ -89,11 +91,13 @@ def test_images_and_vectors_are_mixed_and_each_is_predicted_at_its_place():
 
 
 def test_predictions_of_one_kind_do_not_depend_on_the_order_of_the_keys():
-    heads, params = make(dict(reversed(MIXED.items())))
-    other, _ = make(MIXED)
+    heads, params, state = make(dict(reversed(MIXED.items())))
+    other, _, _ = make(MIXED)
     obs = random_obs(MIXED)
     shuffled = dict(reversed(obs.items()))
-    np.testing.assert_array_equal(heads.encode(params, shuffled), other.encode(params, obs))
+    np.testing.assert_array_equal(
+        heads.encode(params, state, shuffled), other.encode(params, state, obs)
+    )
 
 
 @pytest.mark.parametrize(

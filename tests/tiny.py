@@ -25,14 +25,14 @@ CONFIG = config_lib.Config(
     compute_dtype="float32",
     log_every=16,
     save_every=32,
-    world_model=config_lib.WorldModelConfig(
+    world_model=config_lib.RSSMConfig(
         deter=32, hidden=16, stoch=4, classes=4, units=16, blocks=4, bins=41
     ),
     actor=config_lib.ActorConfig(layers=1, units=16),
     critic=config_lib.CriticConfig(layers=1, units=16, bins=41),
     imagination=config_lib.ImaginationConfig(horizon=3),
     value_alignment=config_lib.ValueAlignmentConfig(warmup_steps=24),
-    optimizer=config_lib.OptimizerConfig(learning_rate=1e-3, warmup_updates=2),
+    optimizer=config_lib.LaPropConfig(learning_rate=1e-3, warmup_updates=2),
     replay=config_lib.ReplayConfig(capacity=64, batch_size=2, batch_length=8),
 )
 

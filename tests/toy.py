@@ -14,6 +14,7 @@ SPEC = EnvSpec("toy", vector(3), 1, False, 2, 1, None)
 class Learner(NamedTuple):
     params: Params
     opt_state: Any
+    model_state: Any = ()
 
 
 class State(NamedTuple):

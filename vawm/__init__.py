@@ -5,7 +5,7 @@
     vawm.envs           18 tasks of the DeepMind Control Suite on MJX, and probes
     vawm.envs.host      Atari, DMC vision and Gymnasium, stepped in processes of their own
     vawm.world_model, vawm.actor_critic, vawm.agent     the agent as pure functions
-    vawm.objective, vawm.learner                        its loss, its update
+    vawm.objective, vawm.learner, vawm.learn            its loss, one update, those due
     vawm.train, vawm.host_train         the step around MJX, and around host environments
     vawm.runner, vawm.checkpoint        runs on disk
     vawm.evaluate, vawm.scores          protocols of the suites, and published scores

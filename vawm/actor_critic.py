@@ -12,6 +12,7 @@ from vawm import distributions, nets, transforms
 from vawm.config import ActorConfig, CriticConfig
 from vawm.distributions import Policy
 from vawm.errors import InvalidInput
+from vawm.transforms import TwoHot
 from vawm.types import Array, EnvSpec, Key, Latent, PyTree
 
 
@@ -28,8 +29,7 @@ class Critic(NamedTuple):
 
     init: Callable[[Key], PyTree]
     logits: Callable[[PyTree, Latent], Array]  # [..., bins]
-    mean: Callable[[Array], Array]  # [..., bins] -> [...], in environment units
-    bins: Array  # [bins] values of the two-hot bins
+    code: TwoHot  # what the logits say
 
 
 def features(latent: Latent) -> tuple[Array, Array]:
@@ -49,14 +49,8 @@ def make_actor(
         remedy = "use 1: only discrete policies have one"
         raise InvalidInput("actor.collect_temperature", config.collect_temperature, remedy)
     heads = 1 if spec.discrete else 2
-    net = nets.MLP(
-        feature_size,
-        config.layers,
-        config.units,
-        (spec.action_size,) * heads,
-        (0.01,) * heads,
-        dtype,
-    )
+    outputs = (spec.action_size,) * heads
+    net = make_network(config, feature_size, outputs, scale=0.01, dtype=dtype)
 
     def init(key: Key) -> PyTree:
         return net.init(key, jnp.zeros((1, feature_size), dtype))["params"]
@@ -84,9 +78,8 @@ def make_actor(
 def make_critic(
     config: CriticConfig, feature_size: int, dtype: jnp.dtype = jnp.float32
 ) -> Critic:
-    """Symexp two-hot critic whose last layer starts at zero, so it starts by predicting 0."""
-    bins = transforms.symexp_bins(config.bins)
-    net = nets.MLP(feature_size, config.layers, config.units, (config.bins,), (0.0,), dtype)
+    """Two-hot critic. DreamerV3's last layer starts at zero, so it starts by predicting 0."""
+    net = make_network(config, feature_size, (config.bins,), scale=0.0, dtype=dtype)
 
     def init(key: Key) -> PyTree:
         return net.init(key, jnp.zeros((1, feature_size), dtype))["params"]
@@ -94,7 +87,19 @@ def make_critic(
     def logits(params: PyTree, latent: Latent) -> Array:
         return net.apply({"params": params}, *features(latent))[0].astype(jnp.float32)
 
-    def mean(logits: Array) -> Array:
-        return transforms.two_hot_mean(logits, bins)
+    return Critic(init, logits, transforms.make_two_hot(config.bins, config.bin_spacing))
 
-    return Critic(init, logits, mean, bins)
+
+def make_network(
+    config: ActorConfig | CriticConfig,
+    feature_size: int,
+    outputs: tuple[int, ...],
+    *,
+    scale: float,
+    dtype: jnp.dtype,
+) -> nets.MLP | nets.ReluMLP:
+    """The layers; `scale` is that of DreamerV3's initial outputs, STORM's are PyTorch's."""
+    sizes = feature_size, config.layers, config.units, outputs
+    if config.network == "storm":
+        return nets.ReluMLP(*sizes, dtype=dtype)
+    return nets.MLP(*sizes, scales=(scale,) * len(outputs), dtype=dtype)

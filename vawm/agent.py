@@ -8,16 +8,17 @@ import jax
 import jax.numpy as jnp
 
 from vawm.actor_critic import Actor, Critic, make_actor, make_critic
-from vawm.config import Config
-from vawm.types import Array, EnvSpec, Key, Latent, Params, PyTree, TimeStep
+from vawm.config import Config, RSSMConfig, StormConfig
+from vawm.types import Array, EnvSpec, Key, Params, PyTree, TimeStep
 from vawm.world_model.protocol import WorldModel
 from vawm.world_model.rssm import rssm
+from vawm.world_model.storm import storm
 
 
 class PolicyCarry(NamedTuple):
     """What an agent remembers between observations."""
 
-    latent: Latent
+    memory: PyTree  # the world model's
     action: Array  # [N, A], the raw action that left from the previous observation
 
 
@@ -29,25 +30,24 @@ class Agent(NamedTuple):
     actor: Actor
     critic: Critic
 
-    def init(self, key: Key) -> Params:
-        """Fresh parameters."""
+    def init(self, key: Key) -> tuple[Params, PyTree]:
+        """Fresh parameters, and the state of the world model beside them."""
         key_world_model, key_actor, key_critic = jax.random.split(key, 3)
-        return Params(
-            world_model=self.world_model.init(key_world_model),
-            actor=self.actor.init(key_actor),
-            critic=self.critic.init(key_critic),
-        )
+        world_model, state = self.world_model.init(key_world_model)
+        actor, critic = self.actor.init(key_actor), self.critic.init(key_critic)
+        return Params(world_model, actor, critic), state
 
     def initial(self, batch_size: int) -> PolicyCarry:
         """The carry before the first observation."""
         return PolicyCarry(
-            latent=self.world_model.initial(batch_size),
+            memory=self.world_model.initial(batch_size),
             action=jnp.zeros((batch_size, self.spec.action_size)),
         )
 
     def act(
         self,
         params: Params,
+        state: PyTree,
         key: Key,
         carry: PolicyCarry,
         timestep: TimeStep,
@@ -61,27 +61,38 @@ class Agent(NamedTuple):
 
         Args:
           params: of the agent.
+          state: of its world model.
           key: for latents and actions.
           carry: what the agent remembers.
           timestep: what has arrived.
           how: sample the policy; sample what collects, at its temperature; or take the
             policy's mode.
         """
-        key_observe, key_action = jax.random.split(key)
-        latent, _ = self.world_model.observe(
+        key_filter, key_action = jax.random.split(key)
+        memory, latent = self.world_model.filter(
             params.world_model,
-            key_observe,
-            carry.latent,
-            jax.tree.map(lambda x: x[:, None], timestep.obs),
-            carry.action[:, None],
-            timestep.is_first[:, None],
-            train=False,
+            state,
+            key_filter,
+            carry.memory,
+            timestep.obs,
+            carry.action,
+            timestep.is_first,
         )
         choose = self.actor.behaviour if how == "collect" else self.actor.policy
         policy = choose(params.actor, latent)
         action = policy.mode() if how == "mode" else policy.sample(key_action)
         action = jnp.where(timestep.is_last[:, None], 0.0, action)
-        return PolicyCarry(latent, action), action
+        return PolicyCarry(memory, action), action
+
+    def random_action(self, key: Key, timestep: TimeStep) -> Array:
+        """Any action, each as likely as another: of all choices, or of all in [-1, 1]."""
+        shape = (*timestep.is_last.shape, self.spec.action_size)
+        if self.spec.discrete:
+            chosen = jax.random.randint(key, shape[:-1], 0, shape[-1])
+            action = jax.nn.one_hot(chosen, shape[-1])
+        else:
+            action = jax.random.uniform(key, shape, minval=-1.0, maxval=1.0)
+        return jnp.where(timestep.is_last[:, None], 0.0, action)
 
 
 def resolve_dtype(compute_dtype: str) -> jnp.dtype:
@@ -94,11 +105,17 @@ def resolve_dtype(compute_dtype: str) -> jnp.dtype:
 def make_agent(config: Config, spec: EnvSpec) -> Agent:
     """The agent that `config` describes, for environments of `spec`."""
     dtype = resolve_dtype(config.compute_dtype)
-    model = config.world_model
+    model, noise = config.world_model, config.value_alignment.noise
     feature_size = model.deter + model.stoch * model.classes
+    if isinstance(model, StormConfig):
+        world_model = storm(model, spec, dtype=dtype, noise=noise)
+    elif isinstance(model, RSSMConfig):
+        world_model = rssm(model, spec, dtype=dtype, noise=noise)
+    else:
+        raise TypeError(f"no world model for {type(model).__name__}")
     return Agent(
         spec=spec,
-        world_model=rssm(model, spec, dtype=dtype, noise=config.value_alignment.noise),
+        world_model=world_model,
         actor=make_actor(config.actor, spec, feature_size, dtype),
         critic=make_critic(config.critic, feature_size, dtype),
     )

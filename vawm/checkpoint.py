@@ -2,6 +2,7 @@
 
     <logdir>/checkpoints/<env_steps>/
         params/          Orbax: what is needed to act
+        model_state/     Orbax: and what the world model carries beside it, if anything
         state/           Orbax: everything else (optimiser, replay, environments, keys, ...)
         images/          Orbax: replayed images, where they are kept on the host
         episodes/        Orbax: what environments on the host did since their last reset
@@ -35,7 +36,12 @@ from vawm.errors import InvalidInput
 from vawm.manifest import LeafInfo, Manifest, leaf_info
 from vawm.types import EnvSpec, PyTree
 
-PREFIXES = {"params": ".learner.params", "images": ".images", "state": ""}
+PREFIXES = {
+    "params": ".learner.params",
+    "model_state": ".learner.model_state",
+    "images": ".images",
+    "state": "",
+}
 """Item -> what its paths begin with; the first that fits has a leaf."""
 ON_HOST = ("images", "episodes")  # these stay arrays of numpy
 SCRATCH = "tmp-"
@@ -99,7 +105,7 @@ def save(
     items = _items(flatten(state))
     if episodes is not None:
         items["episodes"] = dict(episodes)
-    _refuse_nonfinite(items["params"])
+    _refuse_nonfinite(items["params"] | items.get("model_state", {}))
     infos = {
         item: {path: leaf_info(leaf) for path, leaf in leaves.items()}
         for item, leaves in items.items()
@@ -160,10 +166,19 @@ def restore_episodes(logdir: str | os.PathLike[str]) -> dict[str, np.ndarray] | 
     return _read(path, manifest, "episodes", expected)
 
 
-def restore_params(logdir: str | os.PathLike[str], target: PyTree) -> tuple[PyTree, Manifest]:
-    """The parameters alone; nothing else of the checkpoint is read."""
+def restore_agent(
+    logdir: str | os.PathLike[str], params: PyTree, model_state: PyTree
+) -> tuple[tuple[PyTree, PyTree], Manifest]:
+    """What acting needs, like the two trees given; nothing else of the checkpoint is read."""
     path, manifest = read_manifest(logdir)
-    return unflatten(target, _read(path, manifest, "params", flatten(target))), manifest
+    targets = {"params": params, "model_state": model_state}
+    restored = [
+        unflatten(target, _read(path, manifest, item, flatten(target)))
+        if jax.tree.leaves(target)
+        else target
+        for item, target in targets.items()
+    ]
+    return (restored[0], restored[1]), manifest
 
 
 def flatten(tree: PyTree) -> Leaves:
@@ -189,8 +204,9 @@ def _items(leaves: Leaves) -> dict[str, Leaves]:
     return items
 
 
-def _refuse_nonfinite(params: Leaves) -> None:
-    for path, leaf in params.items():
+def _refuse_nonfinite(needed: Leaves) -> None:
+    """What acting needs has to be finite."""
+    for path, leaf in needed.items():
         if not bool(jnp.isfinite(leaf).all()):
             raise SaveError(f"parameter {path} is not finite; no checkpoint is written")
 

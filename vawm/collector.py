@@ -16,8 +16,8 @@ from vawm import replay
 from vawm.agent import Agent, PolicyCarry
 from vawm.config import Config
 from vawm.envs.protocol import Environment
-from vawm.replay import Replay
-from vawm.types import Array, Key, Latent, Metrics, Params, PyTree, TimeStep, Trajectory
+from vawm.replay import Replay, Stored
+from vawm.types import Array, Key, Metrics, Params, PyTree, TimeStep, Trajectory
 
 
 class Collector(NamedTuple):
@@ -35,19 +35,36 @@ class Departure(NamedTuple):
     """What an action leaves behind: the step to store, and the latent inferred there."""
 
     trajectory: Trajectory  # [N, ...]
-    latent: Latent  # [N, ...]
+    latent: Stored  # [N, ...]
 
 
-Collect = Callable[[Params, Collector, Replay, Key], tuple[Collector, Replay, Metrics]]
+Collect = Callable[[Params, PyTree, Collector, Replay, Key], tuple[Collector, Replay, Metrics]]
 
 
 def depart(
-    agent: Agent, params: Params, collector: Collector, key: Key
+    agent: Agent,
+    params: Params,
+    state: PyTree,
+    collector: Collector,
+    key: Key,
+    *,
+    random_steps: int,
 ) -> tuple[Collector, Departure]:
-    """Acts on what has arrived. The action, `[N, A]`, is that of the departure."""
+    """Acts on what has arrived. The action, `[N, A]`, is that of the departure.
+
+    Before env step `random_steps` it is a random one instead.
+    """
     timestep = collector.timestep
-    carry, action = agent.act(params, key, collector.carry, timestep, how="collect")
-    stored = Departure(Trajectory(*timestep, action=action), carry.latent)
+    if random_steps:
+        key, key_random = jax.random.split(key)
+        anything = agent.random_action(key_random, timestep)
+    carry, action = agent.act(params, state, key, collector.carry, timestep, how="collect")
+    if random_steps:
+        action = jnp.where(collector.env_steps < random_steps, anything, action)
+        carry = carry._replace(action=action)
+    stored = Departure(
+        Trajectory(*timestep, action=action), agent.world_model.memory(carry.memory)
+    )
     return collector._replace(carry=carry), stored
 
 
@@ -78,10 +95,12 @@ def arrive(
 
 
 def make_collect(env: Environment, agent: Agent, config: Config) -> Collect:
-    """Build `collect(params, collector, replay, key)`: K steps in each environment."""
+    """Build `collect(params, state, collector, replay, key)`: K steps in each environment."""
 
-    def step(params: Params, collector: Collector, key: Key):
-        collector, stored = depart(agent, params, collector, key)
+    def step(params: Params, state: PyTree, collector: Collector, key: Key):
+        collector, stored = depart(
+            agent, params, state, collector, key, random_steps=config.random_steps
+        )
         env_state, timestep = env.step(collector.env_state, stored.trajectory.action)
         collector, metrics = arrive(
             collector._replace(env_state=env_state),
@@ -91,10 +110,10 @@ def make_collect(env: Environment, agent: Agent, config: Config) -> Collect:
         metrics["env/nonfinite"] = jnp.sum(timestep.is_last & (env_state.steps < 0))
         return collector, (stored, metrics)
 
-    def collect(params: Params, collector: Collector, buffer: Replay, key: Key):
+    def collect(params: Params, state: PyTree, collector: Collector, buffer: Replay, key: Key):
         keys = jax.random.split(key, config.collect_steps)
         collector, (stored, metrics) = jax.lax.scan(
-            lambda c, k: step(params, c, k), collector, keys
+            lambda c, k: step(params, state, c, k), collector, keys
         )
         trajectory, latent = jax.tree.map(lambda x: x.swapaxes(0, 1), stored)
         buffer = replay.add(buffer, trajectory, latent)

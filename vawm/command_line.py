@@ -1,7 +1,7 @@
 """The command line of experiments: tyro over `Config`, two phases, one line per error.
 
-`--preset` and `--size` choose the defaults, or `--resume` takes those of the saved run;
-every other flag then overrides one field of `Config`. Two fields follow from others: a new
+`--agent`, `--preset` and `--size` choose the defaults, or `--resume` takes those of the saved
+run; every other flag then overrides one field of `Config`. Two fields follow from others: a new
 run of a small preset gets a warm-up for its length, and one with widths of its own is of size
 custom.
 """
@@ -110,6 +110,7 @@ def _without_alias(word: str, aliases: Mapping[str, str]) -> str:
 def _defaults(argv: list[str], suite: str, preset: str) -> Config:
     """First phase: the config that the flags of the second override."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    parser.add_argument("--agent", nargs="?")
     parser.add_argument("--preset", nargs="?")
     parser.add_argument("--size", nargs="?")
     parser.add_argument("--env-steps", "--env_steps", nargs="?")
@@ -121,13 +122,17 @@ def _defaults(argv: list[str], suite: str, preset: str) -> Config:
         raise InvalidInput("--resume", True, "takes no value; write --resume alone") from None
     if not known.resume or {"-h", "--help"} & set(argv):
         size = None if known.size == config_lib.CUSTOM else known.size
-        config = validate.preset(suite, known.preset or preset, size)
+        agent = known.agent or "dreamerv3"
+        config = validate.preset(agent, suite, known.preset or preset, size)
         return _with_its_warmup(config, known.env_steps)
     if known.logdir is None:
         raise InvalidInput("logdir", None, "--resume needs the --logdir of the run")
     saved = resume.saved_config(known.logdir)
+    if known.agent not in (None, saved.agent):  # whose choices are others: refused here
+        validate.check_choice("agent", known.agent, config_lib.AGENT_CONFIGS)
+        resume.check(known.logdir, dataclasses.replace(saved, agent=known.agent))
     if known.size not in (None, saved.size, config_lib.CUSTOM):
-        validate.check_choice("size", known.size, config_lib.SIZES)
+        validate.check_choice("size", known.size, config_lib.SIZES[saved.agent])
         return config_lib.with_size(saved, known.size)
     return saved
 
@@ -147,19 +152,21 @@ def _with_its_warmup(config: Config, env_steps: str | None) -> Config:
 
 def is_small(config: Config) -> bool:
     """Whether this run is of a preset for a CPU: any but that of the paper."""
-    return config.preset != "paper" and config.preset in presets.PRESETS[config.suite]
+    return config.preset != "paper" and config.preset in presets.of(config)
 
 
 def scaled_warmup(config: Config, env_steps: int) -> int:
     """The warm-up of a small preset, in env steps, for another length: the same share."""
-    usual = presets.PRESETS[config.suite][config.preset]
+    usual = presets.of(config)[config.preset]
     return usual.value_alignment.warmup_steps * env_steps // usual.env_steps
 
 
 def _with_its_size(config: Config) -> Config:
     """`config`; of size custom where a width is not the one of its size."""
     size = config.size
-    if size not in config_lib.SIZES or config == config_lib.with_size(config, size):
+    if size not in config_lib.SIZES[config.agent] or config == config_lib.with_size(
+        config, size
+    ):
         return config
     return dataclasses.replace(config, size=config_lib.CUSTOM)
 
@@ -174,13 +181,10 @@ def default_logdir(config: Config) -> pathlib.Path:
 def describe(config: Config) -> str:
     """What the chosen preset is for, in a few lines."""
     head = (
-        f"preset {config.preset}: {config.suite} {config.task}, "
+        f"{config.agent}, preset {config.preset}: {config.suite} {config.task}, "
         f"{config.env_steps:,} env steps, size {config.size}, seed {config.seed}"
     )
-    alignment, paper = (
-        _describe_alignment(config),
-        presets.PRESETS[config.suite].get("paper"),
-    )
+    alignment, paper = _describe_alignment(config), presets.of(config).get("paper")
     if not is_small(config):
         return f"{head}\nvalue alignment: {alignment}"
     lines = [head, "  for a CPU with 2 cores; this is not the paper's setting"]
@@ -196,7 +200,7 @@ def describe(config: Config) -> str:
 def _describe_alignment(config: Config) -> str:
     """From when on value alignment is active, and for how much of the run."""
     alignment = config.value_alignment
-    paper = presets.PRESETS[config.suite].get("paper", presets.PAPER)
+    paper = presets.of(config).get("paper", presets.PAPER)
     if alignment.weight == "off":
         return "off"
     in_updates = alignment.warmup_unit == "updates"

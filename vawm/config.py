@@ -1,32 +1,74 @@
 """Every choice of a run, as frozen dataclasses; `vawm.presets` has values of them.
 
-Numbers are Table 15 of the paper unless their comment names another source. Nothing here
-imports the rest of the package. Factories read these; losses only ever receive numbers.
+Numbers are those of the paper, Table 15 for DreamerV3 and Tables 7-14 for STORM, unless their
+comment names another source. Nothing here imports the rest of the package. Factories read
+these; losses only ever receive numbers.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
+
+Network = Literal["dreamerv3", "storm"]
+"""Hidden layers: with bias, RMSNorm, SiLU; or without bias, LayerNorm, ReLU."""
+Bins = Literal["symexp", "symlog"]
+"""Bins of a two-hot code: values spaced by symexp, or evenly spaced values of symlog."""
 
 
 @dataclass(frozen=True)
 class WorldModelConfig:
+    """What all world models have."""
+
+    deter: int
+    """width of h"""
+    stoch: int
+    """number of categoricals in z"""
+    classes: int
+    """classes of each categorical"""
+    units: int
+    """width of the hidden layers of encoder, decoder, reward and continue heads"""
+    depth: int
+    """channels of the image encoder's first stage and the decoder's last, up to a factor"""
+    bins: int
+    """bins of the two-hot reward"""
+    bin_spacing: Bins
+    """symexp: values spaced by symexp; symlog: evenly spaced symlogs, whose mean is decoded"""
+    unimix: float
+    """uniform share mixed into prior and posterior"""
+    free_nats: float
+    free_nats_of: Literal["state", "batch"]
+    """what has them: the KL of each state, or the mean over the batch, whose gradient then is 0
+    for all states at once"""
+    continue_target: Literal["discounted", "plain"]
+    """what the continue head learns where an episode goes on: gamma, or 1"""
+    reconstruction_scale: float
+    dynamics_scale: float
+    representation_scale: float
+
+
+@dataclass(frozen=True)
+class RSSMConfig(WorldModelConfig):
     """RSSM of DreamerV3 with block GRU; widths default to size 12m."""
 
     deter: int = 2048
-    """width of h"""
-    hidden: int = 256
-    """width of the layers around h"""
     stoch: int = 32
-    """number of categoricals in z"""
     classes: int = 16
-    """classes of each categorical"""
     units: int = 256
-    """width of encoder, decoder, reward and continue layers"""
     depth: int = 16
     """channels of the image encoder and decoder, whose stages have 2, 3, 4 and 4 times these"""
+    bins: int = 255
+    bin_spacing: Bins = "symexp"
+    unimix: float = 0.01
+    free_nats: float = 1.0
+    free_nats_of: Literal["state", "batch"] = "state"
+    continue_target: Literal["discounted", "plain"] = "discounted"
+    reconstruction_scale: float = 1.0
+    dynamics_scale: float = 1.0
+    representation_scale: float = 0.1
+    hidden: int = 256
+    """width of the layers around h"""
     blocks: int = 8
     """blocks of the block-diagonal GRU"""
     prior_layers: int = 2
@@ -34,20 +76,57 @@ class WorldModelConfig:
     decoder_layers: int = 3
     reward_layers: int = 1
     continue_layers: int = 1
+
+
+@dataclass(frozen=True)
+class StormConfig(WorldModelConfig):
+    """The transformer world model of STORM: Tables 7-14, and the official code where they are
+    silent."""
+
+    deter: int = 512
+    """width of the transformer, whose output is h"""
+    stoch: int = 32
+    classes: int = 32
+    units: int = 512
+    depth: int = 32
+    """channels of the image encoder and decoder, whose stages have 1, 2, 4 and 8 times these"""
     bins: int = 255
-    """bins of the symexp two-hot reward"""
+    bin_spacing: Bins = "symlog"
     unimix: float = 0.01
-    """uniform share mixed into prior and posterior"""
     free_nats: float = 1.0
+    free_nats_of: Literal["state", "batch"] = "batch"
+    """batch: the official code; state: as DreamerV3"""
+    continue_target: Literal["discounted", "plain"] = "plain"
     reconstruction_scale: float = 1.0
-    dynamics_scale: float = 1.0
+    dynamics_scale: float = 0.5
     representation_scale: float = 0.1
+    blocks: int = 2
+    """transformer blocks"""
+    heads: int = 8
+    feedforward: int = 1024
+    """hidden width of a block's feed-forward layer"""
+    dropout: float = 0.1
+    positions: int = 64
+    """learned positions: no sequence can be longer"""
+    vector_layers: int = 2
+    """hidden layers of encoder and decoder of vectors, which the paper has not"""
+    head_layers: int = 2
+    """hidden layers of the reward and continue heads"""
+    act_context: int = 16
+    """steps that the agent remembers while it acts"""
+    act_latent: Literal["prior", "posterior"] = "prior"
+    """what the policy reads: the prediction, made before the observation is seen, as in the
+    official code; or what is inferred from the observation"""
+    clear_context: bool = False
+    """whether acting forgets the episode before; the official code does not"""
 
 
 @dataclass(frozen=True)
 class ActorConfig:
     layers: int = 3
     units: int = 256
+    network: Network = "dreamerv3"
+    """hidden layers: biased, RMSNorm, SiLU; or, storm, without bias, LayerNorm, ReLU"""
     unimix: float = 0.01
     """uniform share of a discrete policy"""
     min_std: float = 0.1
@@ -64,12 +143,19 @@ class ActorConfig:
 class CriticConfig:
     layers: int = 3
     units: int = 256
+    network: Network = "dreamerv3"
+    """hidden layers as the actor's; dreamerv3 starts by predicting 0, storm does not"""
     bins: int = 255
+    bin_spacing: Bins = "symexp"
+    """symexp: values spaced by symexp; symlog: evenly spaced symlogs, whose mean is decoded"""
     scale: float = 1.0
     slow_rate: float = 0.02
     """1 - EMA decay of the slow critic"""
     slow_scale: float = 1.0
-    """weight of the slow critic as a regulariser"""
+    """weight of the slow critic's target"""
+    slow_target: Literal["value", "returns"] = "value"
+    """the second target: the slow critic's value, as in DreamerV3; or the lambda-returns of its
+    values, as in STORM's official code"""
     replay_scale: float = 0.3
     """weight of the replay value loss"""
     replay_gradient: bool = True
@@ -79,6 +165,18 @@ class CriticConfig:
 @dataclass(frozen=True)
 class ImaginationConfig:
     horizon: int = 15
+    starts: Literal["posteriors", "contexts"] = "posteriors"
+    """every inferred state of the batch; or the states predicted after contexts of their own"""
+    batch_size: int = 1024
+    """contexts drawn for one update"""
+    context_length: int = 8
+    """steps of a context"""
+    value_index: Literal["next", "current"] = "next"
+    """whose value lambda-returns mix in: of s_{t+1}, Eq. 7; or of s_t, STORM's official code"""
+    continuation: Literal["probability", "threshold"] = "probability"
+    """how the continue head is read: its probability, or 0 below one half and 1 above"""
+    reach_weights: bool = True
+    """whether imagined states count by the probability of getting there"""
     lambda_: float = 0.95
     discount_horizon: float = 333.0
     """gamma = 1 - 1 / discount_horizon"""
@@ -112,6 +210,11 @@ class ValueAlignmentConfig:
 
 @dataclass(frozen=True)
 class OptimizerConfig:
+    """How parameters follow gradients: depends on the agent."""
+
+
+@dataclass(frozen=True)
+class LaPropConfig(OptimizerConfig):
     """LaProp after per-tensor adaptive gradient clipping, for all parameters at once."""
 
     learning_rate: float = 4e-5
@@ -122,6 +225,25 @@ class OptimizerConfig:
     beta1: float = 0.9
     beta2: float = 0.999
     epsilon: float = 1e-20
+
+
+@dataclass(frozen=True)
+class AdamConfig(OptimizerConfig):
+    """First the world model, then actor and critic in what it has become; Table 14.
+
+    Each has an Adam of its own after clipping by the global norm of its gradient.
+    """
+
+    learning_rate: float = 1e-4
+    """of the world model"""
+    clip: float = 1000.0
+    epsilon: float = 1e-8
+    behaviour_learning_rate: float = 3e-5
+    """of actor and critic together"""
+    behaviour_clip: float = 100.0
+    behaviour_epsilon: float = 1e-5
+    beta1: float = 0.9
+    beta2: float = 0.999
 
 
 @dataclass(frozen=True)
@@ -226,6 +348,20 @@ ENV_CONFIGS: dict[str, type[EnvConfig]] = {
 """Suite -> what can be chosen of its environments."""
 
 
+class AgentConfigs(NamedTuple):
+    """What an agent takes in the place of `WorldModelConfig` and `OptimizerConfig`."""
+
+    world_model: type[WorldModelConfig]
+    optimizer: type[OptimizerConfig]
+
+
+AGENT_CONFIGS = {
+    "dreamerv3": AgentConfigs(RSSMConfig, LaPropConfig),
+    "storm": AgentConfigs(StormConfig, AdamConfig),
+}
+"""Agent -> what can be chosen of it."""
+
+
 @dataclass(frozen=True)
 class Config:
     """One run. `env_steps` counts control steps, action repeat included."""
@@ -233,8 +369,8 @@ class Config:
     suite: Literal["dmc_proprio", "dmc_vision", "atari100k", "gymnasium"] = "dmc_proprio"
     """where the task is from"""
     task: str = "cartpole_swingup"
-    agent: Literal["dreamerv3"] = "dreamerv3"
-    """which world model imagines"""
+    agent: Literal["dreamerv3", "storm"] = "dreamerv3"
+    """which world model imagines: a recurrent one, or a transformer"""
     preset: str = "paper"
     """where the other numbers come from: an entry of `presets.PRESETS`, or custom"""
     size: str = "12m"
@@ -245,6 +381,8 @@ class Config:
     action_repeat: int = 2
     train_ratio: int = 512
     """replayed steps per collected step; updates = train_ratio / (batch_size * batch_length)"""
+    random_steps: int = 0
+    """env steps before which actions are random, each as likely as any other"""
     collect_steps: int = 1
     """steps in every environment between updates, inside one jitted call"""
     compute_dtype: Literal["auto", "float32", "bfloat16"] = "auto"
@@ -253,12 +391,12 @@ class Config:
     """env steps between lines of metrics.jsonl"""
     save_every: int = 50_000
     """env steps between checkpoints"""
-    world_model: WorldModelConfig = field(default_factory=WorldModelConfig)
+    world_model: WorldModelConfig = field(default_factory=RSSMConfig)
     actor: ActorConfig = field(default_factory=ActorConfig)
     critic: CriticConfig = field(default_factory=CriticConfig)
     imagination: ImaginationConfig = field(default_factory=ImaginationConfig)
     value_alignment: ValueAlignmentConfig = field(default_factory=ValueAlignmentConfig)
-    optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
+    optimizer: OptimizerConfig = field(default_factory=LaPropConfig)
     replay: ReplayConfig = field(default_factory=ReplayConfig)
     video: VideoConfig = field(default_factory=VideoConfig)
     env: EnvConfig = field(default_factory=EnvConfig)
@@ -268,9 +406,8 @@ CUSTOM = "custom"
 """the preset or size of a run that none of `presets.PRESETS` or `SIZES` describes"""
 
 
-@dataclass(frozen=True)
-class Size:
-    """Widths of one model size; the other numbers do not change with size."""
+class RSSMSize(NamedTuple):
+    """Widths of one size of DreamerV3; the other numbers do not change with size."""
 
     deter: int
     hidden: int
@@ -279,33 +416,44 @@ class Size:
     depth: int
 
 
-SIZES = {
-    "1m": Size(deter=512, hidden=64, classes=4, units=64, depth=4),
-    "12m": Size(deter=2048, hidden=256, classes=16, units=256, depth=16),
-    "25m": Size(deter=3072, hidden=384, classes=24, units=384, depth=24),
-    "50m": Size(deter=4096, hidden=512, classes=32, units=512, depth=32),
-    "100m": Size(deter=6144, hidden=768, classes=48, units=768, depth=48),
-    "200m": Size(deter=8192, hidden=1024, classes=64, units=1024, depth=64),
-    "400m": Size(deter=12288, hidden=1536, classes=96, units=1536, depth=96),
+class StormSize(NamedTuple):
+    """Widths of one size of STORM."""
+
+    deter: int
+    feedforward: int
+    heads: int
+    classes: int
+    units: int
+    depth: int
+
+
+SIZES: dict[str, dict[str, RSSMSize] | dict[str, StormSize]] = {
+    "dreamerv3": {
+        "1m": RSSMSize(deter=512, hidden=64, classes=4, units=64, depth=4),
+        "12m": RSSMSize(deter=2048, hidden=256, classes=16, units=256, depth=16),
+        "25m": RSSMSize(deter=3072, hidden=384, classes=24, units=384, depth=24),
+        "50m": RSSMSize(deter=4096, hidden=512, classes=32, units=512, depth=32),
+        "100m": RSSMSize(deter=6144, hidden=768, classes=48, units=768, depth=48),
+        "200m": RSSMSize(deter=8192, hidden=1024, classes=64, units=1024, depth=64),
+        "400m": RSSMSize(deter=12288, hidden=1536, classes=96, units=1536, depth=96),
+    },
+    "storm": {
+        "1m": StormSize(deter=128, feedforward=256, heads=4, classes=8, units=128, depth=8),
+        "16m": StormSize(deter=512, feedforward=1024, heads=8, classes=32, units=512, depth=32),
+    },
 }
+"""Agent -> name -> widths. STORM's official size is 16m, named after its world model."""
 
 
 def with_size(config: Config, size: str) -> Config:
-    """`config` with the widths of `SIZES[size]`."""
-    widths = SIZES[size]
+    """`config` with the widths of `SIZES[config.agent][size]`."""
+    widths = SIZES[config.agent][size]._asdict()
     return dataclasses.replace(
         config,
         size=size,
-        world_model=dataclasses.replace(
-            config.world_model,
-            deter=widths.deter,
-            hidden=widths.hidden,
-            classes=widths.classes,
-            units=widths.units,
-            depth=widths.depth,
-        ),
-        actor=dataclasses.replace(config.actor, units=widths.units),
-        critic=dataclasses.replace(config.critic, units=widths.units),
+        world_model=dataclasses.replace(config.world_model, **widths),
+        actor=dataclasses.replace(config.actor, units=widths["units"]),
+        critic=dataclasses.replace(config.critic, units=widths["units"]),
     )
 
 

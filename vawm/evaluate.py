@@ -65,7 +65,7 @@ def evaluate(
     if env.spec.num_envs != episodes:
         remedy = f"the environments are {env.spec.num_envs}, one for each; use that"
         raise InvalidInput("episodes", episodes, remedy)
-    returns = play.player(env, policy, how)(policy.params, jax.random.key(seed))
+    returns = play.player(env, policy, how)(policy.params, policy.state, jax.random.key(seed))
     return Score(tuple(map(float, returns)))
 
 

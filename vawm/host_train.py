@@ -21,12 +21,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vawm import image_store, replay
+from vawm import image_store, learn, replay
 from vawm.agent import Agent
 from vawm.collector import Collector, arrive, begin, depart
 from vawm.config import Config
 from vawm.envs.protocol import HostEnvironment
-from vawm.learner import Learner, init_learner, make_update_at
+from vawm.learner import Learner, init_learner
 from vawm.replay import Replay
 from vawm.train import TrainState, empty_replay
 from vawm.types import EnvSpec, Key, Metrics, Params, PyTree, TimeStep
@@ -38,7 +38,8 @@ class Compiled(NamedTuple):
     """The three programs of a step, and the names of what `update` measures.
 
     Attributes:
-      depart: `(params, collector, replay, key) -> (collector, replay, key, key_learn)`.
+      depart: `(params, state, collector, replay, key) -> (collector, replay, key,
+        key_learn)`.
       arrive: `(collector, timestep) -> (collector, metrics)`.
       update: `(learner, replay, positions, images, key_learn, number, env_steps) ->
         (learner, replay, metrics)`.
@@ -50,9 +51,7 @@ class Compiled(NamedTuple):
     metrics: tuple[str, ...]
 
 
-def init(
-    spec: EnvSpec, agent: Agent, config: Config, key: Key, timestep: TimeStep
-) -> TrainState:
+def init(agent: Agent, config: Config, key: Key, timestep: TimeStep) -> TrainState:
     """The state before the first step, but for `images`; `timestep` are first observations."""
     key, key_learner = jax.random.split(key)
     collector = begin(agent, timestep, (), num_envs=config.num_envs)
@@ -63,7 +62,7 @@ def init(
     return TrainState(
         learner=init_learner(agent, config, key_learner),
         collector=collector,
-        replay=empty_replay(spec, stored, config),
+        replay=empty_replay(agent, stored, config),
         credit=jnp.zeros((), jnp.int32),
         key=key,
     )
@@ -91,7 +90,7 @@ def compile_programs(
     """Compiles the programs of a step for states like `state`; shapes are enough."""
     key = jax.eval_shape(lambda: jax.random.key(0))
     positions = jax.eval_shape(lambda: _positions(config))
-    images = jax.eval_shape(lambda: _batch_of_images(spec, config))
+    images = jax.eval_shape(lambda: _images(spec, config))
     number = jax.ShapeDtypeStruct((), jnp.int32)
     learner, collector, buffer = state.learner, state.collector, state.replay
     timestep = first_timestep(spec)
@@ -103,7 +102,9 @@ def compile_programs(
     arguments = learner, buffer, positions, images, key, number, number
     return Compiled(
         depart=build(
-            _make_depart(agent, config), (1, 2), learner.params, collector, buffer, key
+            _make_depart(agent, config),
+            (2, 3),
+            *(learner.params, learner.model_state, collector, buffer, key),
         ),
         arrive=build(_make_arrive(spec), (0,), collector, timestep),
         update=build(update, (0, 1), *arguments),
@@ -122,7 +123,7 @@ def make_step(env: HostEnvironment, config: Config, programs: Compiled) -> HostS
     Raises:
       EnvironmentFailure: in `step`, when an environment fails and may not be restarted.
     """
-    learn = _make_learn(env.spec, config, programs.update)
+    run_updates = _make_updates(env.spec, config, programs.update)
     on_host = config.replay.images == "host"
 
     def step(state: TrainState) -> tuple[TrainState, dict[str, Any]]:
@@ -133,11 +134,11 @@ def make_step(env: HostEnvironment, config: Config, programs: Compiled) -> HostS
                 pending = jax.device_get(collector.timestep.obs)
                 image_store.add(images, pending, at=int(buffer.head))
             collector, buffer, key, key_learn = programs.depart(
-                learner.params, collector, buffer, key
+                learner.params, learner.model_state, collector, buffer, key
             )
             env.send(np.asarray(collector.carry.action))
             if not left:
-                learner, buffer, credit, learned = learn(
+                learner, buffer, credit, learned = run_updates(
                     learner, buffer, images, credit, key_learn, collector.env_steps
                 )
             collector, metrics = programs.arrive(collector, env.receive())
@@ -153,8 +154,8 @@ def make_step(env: HostEnvironment, config: Config, programs: Compiled) -> HostS
     return step
 
 
-def _make_learn(spec: EnvSpec, config: Config, update: Callable) -> Callable:
-    """Build `learn(learner, replay, images, credit, key, env_steps)`: the updates due.
+def _make_updates(spec: EnvSpec, config: Config, update: Callable) -> Callable:
+    """Build `run_updates(learner, replay, images, credit, key, env_steps)`: the updates due.
 
     Batches are drawn with numpy, from the seed and the number of the update alone, so that
     no draw waits for the device.
@@ -163,7 +164,7 @@ def _make_learn(spec: EnvSpec, config: Config, update: Callable) -> Callable:
     earned = config.collect_steps * config.num_envs * config.train_ratio
     on_host = config.replay.images == "host"
 
-    def learn(
+    def run_updates(
         learner: Learner,
         buffer: Replay,
         images: PyTree,
@@ -177,26 +178,31 @@ def _make_learn(spec: EnvSpec, config: Config, update: Callable) -> Callable:
         owed = int(credit) + (earned if ready else 0)
         learned = []
         for number in range(owed // batch_steps):
-            positions = replay.draw_on_host(
-                np.random.default_rng((config.seed, done + number)),
-                *(spec.num_envs, capacity, head, size),
-                batch_size=config.replay.batch_size,
-                length=length + 1,
-            )
-            batch = image_store.read(images, positions) if on_host else ()
+            rng = np.random.default_rng((config.seed, done + number))
+            ring = spec.num_envs, capacity, head, size
+            positions = learn.draw_on_host(config, rng, *ring)
+            pictures = learn.NO_IMAGES
+            if on_host:
+                pictures = learn.Draw(
+                    *(at and image_store.read(images, at) for at in positions)
+                )
             learner, buffer, metrics = update(
-                *(learner, buffer, positions, batch, key, np.int32(number), env_steps)
+                *(learner, buffer, positions, pictures, key, np.int32(number), env_steps)
             )
             learned.append(metrics)
         return learner, buffer, np.int32(owed % batch_steps), learned
 
-    return learn
+    return run_updates
 
 
 def _make_depart(agent: Agent, config: Config) -> Callable:
-    def depart_and_store(params: Params, collector: Collector, buffer: Replay, key: Key):
+    def depart_and_store(
+        params: Params, state: PyTree, collector: Collector, buffer: Replay, key: Key
+    ):
         key, key_act, key_learn = jax.random.split(key, 3)
-        collector, stored = depart(agent, params, collector, key_act)
+        collector, stored = depart(
+            agent, params, state, collector, key_act, random_steps=config.random_steps
+        )
         if config.replay.images == "host":
             obs = image_store.without_images(stored.trajectory.obs)
             stored = stored._replace(trajectory=stored.trajectory._replace(obs=obs))
@@ -214,7 +220,7 @@ def _make_arrive(spec: EnvSpec) -> Callable:
 
 
 def _make_update(agent: Agent, config: Config) -> Callable:
-    update_at = make_update_at(agent, config)
+    update_at = learn.make_update_at(agent, config)
 
     def update(learner, buffer, positions, images, key, number, env_steps):
         key = jax.random.fold_in(key, number)
@@ -223,19 +229,24 @@ def _make_update(agent: Agent, config: Config) -> Callable:
     return update
 
 
-def _positions(config: Config) -> replay.Positions:
-    batch, length = config.replay.batch_size, config.replay.batch_length + 1
-    return replay.Positions(jnp.zeros(batch, jnp.int32), jnp.zeros((batch, length), jnp.int32))
+def _positions(config: Config) -> learn.Draw:
+    def at(shape: tuple[int, int]) -> replay.Positions:
+        return replay.Positions(jnp.zeros(shape[0], jnp.int32), jnp.zeros(shape, jnp.int32))
+
+    return learn.Draw(*(shape and at(shape) for shape in learn.shapes(config)))
 
 
-def _batch_of_images(spec: EnvSpec, config: Config) -> PyTree:
-    """What `image_store.read` returns for a batch; `()` where replay has the images."""
+def _images(spec: EnvSpec, config: Config) -> learn.Draw:
+    """What `image_store.read` returns for a draw; `()` where replay has the images."""
     if config.replay.images == "device":
-        return ()
-    shape = config.replay.batch_size, config.replay.batch_length + 1
-    images = jax.tree.map(lambda x: jnp.zeros((*shape, *x.shape), x.dtype), spec.obs)
-    empty = jax.tree.map(lambda x: jnp.zeros((*shape, 0), x.dtype), spec.obs)
-    return image_store.merge(empty, images)
+        return learn.NO_IMAGES
+
+    def images(shape: tuple[int, int]) -> PyTree:
+        whole = jax.tree.map(lambda x: jnp.zeros((*shape, *x.shape), x.dtype), spec.obs)
+        empty = jax.tree.map(lambda x: jnp.zeros((*shape, 0), x.dtype), spec.obs)
+        return image_store.merge(empty, whole)
+
+    return learn.Draw(*(shape and images(shape) for shape in learn.shapes(config)))
 
 
 def _mean(learned: list[Metrics], names: tuple[str, ...]) -> dict[str, float]:

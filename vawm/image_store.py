@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vawm.replay import Positions
-from vawm.types import ArraySpec, PyTree, is_image
+from vawm.types import ArraySpec, Batch, PyTree, is_image
 
 
 def specs(obs: PyTree, *, num_envs: int, capacity: int) -> PyTree:
@@ -61,3 +61,9 @@ def merge(obs: PyTree, images: PyTree) -> PyTree:
     if isinstance(images, tuple):
         return obs
     return jax.tree.map(lambda x, pixels: pixels if is_image(x) else x, obs, images)
+
+
+def complete(batch: Batch, images: PyTree) -> Batch:
+    """`batch` with the images of its steps; `()` where replay had them."""
+    obs = merge(batch.trajectory.obs, images)
+    return batch._replace(trajectory=batch.trajectory._replace(obs=obs))

@@ -15,6 +15,7 @@ def imagine(
     world_model: WorldModel,
     policy: Callable[[Latent], Policy],
     params: PyTree,
+    state: PyTree,
     key: Key,
     carry: PyTree,
     start: Latent,
@@ -31,6 +32,7 @@ def imagine(
       world_model: the model that imagines.
       policy: pi(a | s), as a function of a latent.
       params: parameters of the world model.
+      state: what it carries beside them.
       key: for actions and latents.
       carry: the world model's imagination state at the starts.
       start: `[N, ...]` the latents to start from.
@@ -41,11 +43,11 @@ def imagine(
       `[H + 1, N, A]`; the last one leads nowhere and only completes the shape.
     """
 
-    def step(state, key):
-        carry, latent = state
+    def step(reached, key):
+        carry, latent = reached
         key_action, key_latent = jax.random.split(key)
         action = policy(latent).sample(key_action)
-        return world_model.imagine(params, key_latent, carry, action), (latent, action)
+        return world_model.imagine(params, state, key_latent, carry, action), (latent, action)
 
     keys = jax.random.split(key, horizon + 1)
     _, (latent, action) = jax.lax.scan(step, (carry, start), keys)

@@ -1,4 +1,9 @@
-"""Learning: one update of everything from one replayed batch, and as many as are due."""
+"""One update of everything that is learned, from one batch.
+
+DreamerV3 follows one gradient of one summed loss, with one optimiser. STORM first updates its
+world model, then actor and critic in what the world model has become, each with an optimiser of
+its own. The losses are the same, those of `vawm.objective`.
+"""
 
 from __future__ import annotations
 
@@ -9,12 +14,12 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from vawm import image_store, optim, replay, returns
+from vawm import optim, returns
 from vawm.agent import Agent
-from vawm.config import Config
-from vawm.objective import Batch, make_behaviour_loss, make_world_model_loss
-from vawm.replay import Positions, Replay
-from vawm.types import Array, Key, Latent, Metrics, Params, PyTree
+from vawm.config import AdamConfig, Config, LaPropConfig
+from vawm.objective import make_behaviour_loss, make_world_model_loss
+from vawm.replay import Stored
+from vawm.types import Array, Batch, Key, Metrics, Params, PyTree
 
 
 class Learner(NamedTuple):
@@ -22,141 +27,195 @@ class Learner(NamedTuple):
 
     step: Array  # [] int32, updates done
     params: Params
+    model_state: PyTree  # what the world model carries beside its parameters
     slow_critic: PyTree
     opt_state: PyTree
     return_scale: returns.ReturnScale
 
 
-Update = Callable[[Learner, Batch, Key, Array], tuple[Learner, Latent, Metrics]]
-UpdateAt = Callable[..., tuple[Learner, Replay, Metrics]]
-Learn = Callable[[Learner, Replay, Key, Array, Array], tuple[Learner, Replay, Metrics]]
+Update = Callable[[Learner, Batch, PyTree, Key, Array], tuple[Learner, Stored, Metrics]]
 
 
 def init_learner(agent: Agent, config: Config, key: Key) -> Learner:
     """Fresh parameters; the slow critic starts as an exact copy of the critic."""
-    params = agent.init(key)
+    params, model_state = agent.init(key)
     return Learner(
         step=jnp.zeros((), jnp.int32),
         params=params,
+        model_state=model_state,
         slow_critic=jax.tree.map(jnp.copy, params.critic),
-        opt_state=optim.make_optimizer(config.optimizer).init(params),
+        opt_state=init_optimizer(config, params),
         return_scale=returns.init_return_scale(),
     )
 
 
-def make_update(agent: Agent, config: Config) -> Update:
-    """Build `update(learner, batch, key, env_steps) -> (learner, latent, metrics)`.
+def init_optimizer(config: Config, params: Params) -> PyTree:
+    """The optimisers' state before the first update."""
+    if isinstance(config.optimizer, AdamConfig):
+        adams = optim.make_adams(config.optimizer)
+        behaviour = adams.behaviour.init((params.actor, params.critic))
+        return optim.Adams(adams.world_model.init(params.world_model), behaviour)
+    assert isinstance(config.optimizer, LaPropConfig)
+    return optim.make_laprop(config.optimizer).init(params)
 
-    One gradient of one summed loss for world model, actor and critic, one optimiser step,
-    one EMA. The returned latent is the posterior of the batch's steps 1..T, to be written
-    back to replay. `env_steps` only gates value alignment.
+
+def make_update(agent: Agent, config: Config) -> Update:
+    """Build `update(learner, batch, contexts, key, env_steps) -> (learner, latent, metrics)`.
+
+    `contexts` are a `Batch` where imagination begins after them, else `()`. The returned latent
+    is what replay keeps beside the batch's steps 1..T, if anything. `env_steps` only gates
+    value alignment.
     """
-    optimizer = optim.make_optimizer(config.optimizer)
+    if isinstance(config.optimizer, AdamConfig):
+        return make_update_in_turn(agent, config, optim.make_adams(config.optimizer))
+    assert isinstance(config.optimizer, LaPropConfig)
+    return make_joint_update(agent, config, optim.make_laprop(config.optimizer))
+
+
+def make_joint_update(
+    agent: Agent, config: Config, optimizer: optax.GradientTransformation
+) -> Update:
+    """One gradient of one summed loss for world model, actor and critic, one step, one EMA."""
     world_model_loss = make_world_model_loss(agent, config)
     behaviour_loss = make_behaviour_loss(agent, config)
 
-    def loss_fn(params: Params, learner: Learner, batch: Batch, key: Key, env_steps: Array):
-        key_observe, key_behaviour = jax.random.split(key)
-        step = env_steps if config.value_alignment.warmup_unit == "env_steps" else learner.step
-        model_loss, inference, model_metrics = world_model_loss(
-            params, learner.slow_critic, batch, key_observe, step
-        )
-        agent_loss, return_scale, agent_metrics = behaviour_loss(
+    def loss_fn(params: Params, learner: Learner, batch, contexts, key: Key, env_steps: Array):
+        key_model, key_behaviour = jax.random.split(key)
+        slow_critic = learner.slow_critic
+        model_loss, (inference, state, model_metrics) = world_model_loss(
             params,
-            learner.slow_critic,
+            learner.model_state,
+            slow_critic,
+            batch,
+            key_model,
+            warmup_step(config, learner, env_steps),
+        )
+        agent_loss, (return_scale, agent_metrics) = behaviour_loss(
+            params,
+            state,
+            slow_critic,
             learner.return_scale,
             batch,
             inference,
+            contexts,
             key_behaviour,
         )
         total = model_loss + agent_loss
         metrics = model_metrics | agent_metrics | {"loss/total": total}
-        return total, (inference.latent, return_scale, metrics)
+        return total, (inference.latent, state, return_scale, metrics)
 
     def update(
-        learner: Learner, batch: Batch, key: Key, env_steps: Array
-    ) -> tuple[Learner, Latent, Metrics]:
-        gradient, (latent, return_scale, metrics) = jax.grad(loss_fn, has_aux=True)(
-            learner.params, learner, batch, key, env_steps
+        learner: Learner, batch: Batch, contexts: PyTree, key: Key, env_steps: Array
+    ) -> tuple[Learner, Stored, Metrics]:
+        gradient, (latent, state, return_scale, metrics) = jax.grad(loss_fn, has_aux=True)(
+            learner.params, learner, batch, contexts, key, env_steps
         )
         updates, opt_state = optimizer.update(gradient, learner.opt_state, learner.params)
-        params = optax.apply_updates(learner.params, updates)
-        rate = config.critic.slow_rate
-        metrics["optimizer/gradient_norm"] = optax.tree.norm(gradient)
-        metrics["optimizer/update_norm"] = optax.tree.norm(updates)
-        return (
-            Learner(
-                step=learner.step + 1,
-                params=params,
-                slow_critic=optax.incremental_update(params.critic, learner.slow_critic, rate),
-                opt_state=opt_state,
-                return_scale=return_scale,
-            ),
-            latent,
-            metrics,
+        metrics |= norms("optimizer", gradient, updates)
+        learner = advance(
+            learner,
+            config,
+            params=optax.apply_updates(learner.params, updates),
+            model_state=state,
+            opt_state=opt_state,
+            return_scale=return_scale,
         )
+        return learner, agent.world_model.memory(latent), metrics
 
     return update
 
 
-def make_update_at(agent: Agent, config: Config) -> UpdateAt:
-    """Build `update_at(learner, replay, positions, images, key, env_steps)`.
+def make_update_in_turn(agent: Agent, config: Config, optimizers: optim.Adams) -> Update:
+    """The world model's step; then imagination in it, and one step of actor and critic."""
+    world_model_loss = make_world_model_loss(agent, config)
+    behaviour_loss = make_behaviour_loss(agent, config)
 
-    One update on what lies at `positions`, `[B, T + 1]` steps of which the first only gives
-    context, and the latents inferred there written back. Returns learner, replay and metrics.
-    `images` are those of the same steps where replay keeps none, else `()`.
-    """
-    update = make_update(agent, config)
+    def of_world_model(world_model: PyTree, params: Params, *arguments):
+        return world_model_loss(params._replace(world_model=world_model), *arguments)
 
-    def update_at(
-        learner: Learner,
-        buffer: Replay,
-        positions: Positions,
-        images: PyTree,
-        key: Key,
-        env_steps: Array,
-    ) -> tuple[Learner, Replay, Metrics]:
-        trajectory, context = replay.read(buffer, positions, classes=config.world_model.classes)
-        obs = image_store.merge(trajectory.obs, images)
-        batch = Batch(trajectory._replace(obs=obs), context)
-        learner, latent, metrics = update(learner, batch, key, env_steps)
-        positions = positions._replace(time=positions.time[:, 1:])
-        return learner, replay.write_back(buffer, positions, latent), metrics
+    def of_behaviour(behaviour: tuple[PyTree, PyTree], params: Params, *arguments):
+        actor, critic = behaviour
+        return behaviour_loss(params._replace(actor=actor, critic=critic), *arguments)
 
-    return update_at
+    def update(
+        learner: Learner, batch: Batch, contexts: PyTree, key: Key, env_steps: Array
+    ) -> tuple[Learner, Stored, Metrics]:
+        key_model, key_behaviour = jax.random.split(key)
+        params, opt_state = learner.params, learner.opt_state
+        (model_loss, (inference, state, metrics)), gradient = jax.value_and_grad(
+            of_world_model, has_aux=True
+        )(
+            params.world_model,
+            params,
+            learner.model_state,
+            learner.slow_critic,
+            batch,
+            key_model,
+            warmup_step(config, learner, env_steps),
+        )
+        updates, model_opt = optimizers.world_model.update(gradient, opt_state.world_model)
+        params = params._replace(world_model=optax.apply_updates(params.world_model, updates))
+        metrics |= norms("optimizer", gradient, updates)
+
+        behaviour = params.actor, params.critic
+        (agent_loss, (return_scale, agent_metrics)), gradient = jax.value_and_grad(
+            of_behaviour, has_aux=True
+        )(
+            behaviour,
+            params,
+            state,
+            learner.slow_critic,
+            learner.return_scale,
+            batch,
+            jax.lax.stop_gradient(inference),
+            contexts,
+            key_behaviour,
+        )
+        updates, behaviour_opt = optimizers.behaviour.update(gradient, opt_state.behaviour)
+        actor, critic = optax.apply_updates(behaviour, updates)
+        metrics |= agent_metrics | norms("optimizer/behaviour", gradient, updates)
+        metrics["loss/total"] = model_loss + agent_loss
+        learner = advance(
+            learner,
+            config,
+            params=Params(params.world_model, actor, critic),
+            model_state=state,
+            opt_state=optim.Adams(model_opt, behaviour_opt),
+            return_scale=return_scale,
+        )
+        return learner, agent.world_model.memory(inference.latent), metrics
+
+    return update
 
 
-def make_learn(agent: Agent, config: Config) -> Learn:
-    """Build `learn(learner, replay, key, env_steps, due) -> (learner, replay, metrics)`.
+def warmup_step(config: Config, learner: Learner, env_steps: Array) -> Array:
+    """The step that value alignment's warm-up counts."""
+    return env_steps if config.value_alignment.warmup_unit == "env_steps" else learner.step
 
-    `due` updates, each on a batch of its own, whose latents are written back before the
-    next is drawn. Metrics are means over the updates, NaN if there is none.
-    """
-    # Jitted, so that asking for shapes is no second trace.
-    update_at = jax.jit(make_update_at(agent, config))
-    size, length = config.replay.batch_size, config.replay.batch_length
 
-    def draw(buffer: Replay, key: Key) -> Positions:
-        return replay.draw(buffer, key, batch_size=size, length=length + 1)
+def norms(name: str, gradient: PyTree, updates: PyTree) -> Metrics:
+    return {
+        f"{name}/gradient_norm": optax.tree.norm(gradient),
+        f"{name}/update_norm": optax.tree.norm(updates),
+    }
 
-    def learn(
-        learner: Learner, buffer: Replay, key: Key, env_steps: Array, due: Array
-    ) -> tuple[Learner, Replay, Metrics]:
-        positions = jax.eval_shape(draw, buffer, key)
-        metrics = jax.eval_shape(update_at, learner, buffer, positions, (), key, env_steps)[-1]
-        sums = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), metrics)
 
-        def one_update(_, state: tuple[Learner, Replay, Key, Metrics]):
-            learner, buffer, key, sums = state
-            key, key_draw, key_update = jax.random.split(key, 3)
-            positions = draw(buffer, key_draw)
-            learner, buffer, metrics = update_at(
-                learner, buffer, positions, (), key_update, env_steps
-            )
-            return learner, buffer, key, jax.tree.map(jnp.add, sums, metrics)
-
-        state = learner, buffer, key, sums
-        learner, buffer, _, sums = jax.lax.fori_loop(0, due, one_update, state)
-        return learner, buffer, jax.tree.map(lambda x: x / due, sums)
-
-    return learn
+def advance(
+    learner: Learner,
+    config: Config,
+    *,
+    params: Params,
+    model_state: PyTree,
+    opt_state: PyTree,
+    return_scale: returns.ReturnScale,
+) -> Learner:
+    """The learner one update later; the slow critic follows the critic."""
+    rate = config.critic.slow_rate
+    return Learner(
+        step=learner.step + 1,
+        params=params,
+        model_state=model_state,
+        slow_critic=optax.incremental_update(params.critic, learner.slow_critic, rate),
+        opt_state=opt_state,
+        return_scale=return_scale,
+    )

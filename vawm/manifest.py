@@ -94,9 +94,16 @@ def config_from_dict(content: dict[str, Any], cls: type = Config) -> Any:
         )
     hints = typing.get_type_hints(cls)
     if cls is Config:
-        hints["env"] = config_lib.ENV_CONFIGS.get(content["suite"])
-        if hints["env"] is None:
-            raise InvalidInput("Config.suite", content["suite"], "is not known (other version)")
+        for name, known in (
+            ("suite", config_lib.ENV_CONFIGS),
+            ("agent", config_lib.AGENT_CONFIGS),
+        ):
+            if content[name] not in known:
+                raise InvalidInput(
+                    f"Config.{name}", content[name], "is not known (other version)"
+                )
+        hints["env"] = config_lib.ENV_CONFIGS[content["suite"]]
+        hints |= config_lib.AGENT_CONFIGS[content["agent"]]._asdict()
     return cls(
         **{
             name: config_from_dict(value, hints[name])

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import jax
 
 from vawm import nets
-from vawm.config import Config, HostEnvConfig, VisionConfig
+from vawm.config import Config, HostEnvConfig, RSSMConfig, StormConfig, VisionConfig
 from vawm.envs.host.crew import cores
 from vawm.errors import InvalidInput
 from vawm.manifest import leaf_info
@@ -151,22 +151,48 @@ def working_bytes(spec: EnvSpec, config: Config) -> int:
     per imagined state (features, actor, critic and its logits), `WORKING_FACTOR` times, and
     the maps of images, `IMAGE_FACTOR` times.
     """
-    model, critic = config.world_model, config.critic
+    model, critic, steps = config.world_model, config.critic, config.replay.batch_steps
     feature = model.deter + model.stoch * model.classes
+    imagined = 2 * feature + config.actor.layers * config.actor.units + 4 * critic.bins
+    states = steps * (config.imagination.horizon + 1)
+    if isinstance(model, StormConfig):
+        observed, cache = _storm_step(model, config), _storm_cache(model, config)
+        states = config.imagination.batch_size * (config.imagination.horizon + 1)
+    else:
+        assert isinstance(model, RSSMConfig)
+        observed, cache = 8 * feature + 4 * _rssm_step(model, config), 0
+    numbers = steps * observed + states * imagined
+    maps = steps * _image_maps(spec, config)
+    return 4 * (WORKING_FACTOR * numbers + cache + IMAGE_FACTOR * maps)
+
+
+def _rssm_step(model: RSSMConfig, config: Config) -> int:
+    """Numbers in the layers around h, for one step of a batch."""
     layers = (
         model.encoder_layers
         + model.decoder_layers
         + model.reward_layers
         + model.continue_layers
         + config.actor.layers
-        + critic.layers
+        + config.critic.layers
     )
-    observed = 8 * feature + 4 * (layers * model.units + model.bins + 3 * critic.bins)
-    imagined = 2 * feature + config.actor.layers * config.actor.units + 4 * critic.bins
-    steps = config.replay.batch_steps
-    numbers = steps * (observed + (config.imagination.horizon + 1) * imagined)
-    maps = steps * _image_maps(spec, config)
-    return 4 * (WORKING_FACTOR * numbers + IMAGE_FACTOR * maps)
+    return layers * model.units + model.bins + 3 * config.critic.bins
+
+
+def _storm_step(model: StormConfig, config: Config) -> int:
+    """Numbers in the transformer and the heads, for one step of a batch."""
+    attention = 2 * model.heads * config.replay.batch_length
+    block = 8 * model.deter + 2 * model.feedforward + attention
+    layers = 2 * model.head_layers + 2 * model.vector_layers + 2 * config.critic.layers
+    flat = model.stoch * model.classes
+    return model.blocks * block + 8 * flat + layers * model.units + 4 * config.critic.bins
+
+
+def _storm_cache(model: StormConfig, config: Config) -> int:
+    """Numbers in the keys and values of imagination."""
+    imagination = config.imagination
+    slots = imagination.context_length + imagination.horizon + 1
+    return 4 * model.blocks * imagination.batch_size * slots * model.deter
 
 
 def _image_maps(spec: EnvSpec, config: Config) -> int:
@@ -176,8 +202,11 @@ def _image_maps(spec: EnvSpec, config: Config) -> int:
         return 0
     size, channels = images[0].shape[0], sum(image.shape[2] for image in images)
     numbers = 2 * size * size * channels  # what is read, and what is predicted
-    for stage, width in enumerate(nets.STAGE_WIDTHS):
-        side = size // 2**stage
+    # DreamerV3 halves after it has made a stage's channels, STORM's strides before.
+    strides = isinstance(config.world_model, StormConfig)
+    widths = nets.STRIDED_WIDTHS if strides else nets.STAGE_WIDTHS
+    for stage, width in enumerate(widths):
+        side = size // 2 ** (stage + strides)
         numbers += 2 * side * side * width * config.world_model.depth
     return numbers
 

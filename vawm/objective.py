@@ -4,7 +4,8 @@
     4 imagine   5 returns and their scale                                       make_foresight
     6 critic and actor                                                     make_behaviour_loss
 
-Losses are pure functions of the same `Params`; their sum is the loss of `vawm.train`.
+Losses are pure functions of the same `Params`; `vawm.learner` differentiates them, as one sum
+or one after the other.
 """
 
 from __future__ import annotations
@@ -19,14 +20,17 @@ from vawm import losses, returns, transforms
 from vawm.agent import Agent
 from vawm.config import Config
 from vawm.imagination import imagine
-from vawm.types import Array, Inference, Key, Latent, Metrics, Params, PyTree, Trajectory
-
-
-class Batch(NamedTuple):
-    """Replayed experience: T + 1 steps, the first of which only gives context."""
-
-    trajectory: Trajectory  # [B, T + 1, ...]
-    context: Latent  # [B, ...] the stored latent of step 0
+from vawm.types import (
+    Array,
+    Batch,
+    Inference,
+    Key,
+    Latent,
+    Metrics,
+    Params,
+    PyTree,
+    Trajectory,
+)
 
 
 def total(parts: Metrics) -> Array:
@@ -35,7 +39,7 @@ def total(parts: Metrics) -> Array:
 
 
 class Alignment(NamedTuple):
-    """L_var at every state of a batch, `[B, T]`; 0 where nothing was predicted."""
+    """L_var at every state of a batch that was predicted, `[B, T]`."""
 
     loss: Array  # Eq. 4, both terms with their scales
     weight: Array  # Eq. 5
@@ -78,8 +82,7 @@ def make_value_alignment(agent: Agent, config: Config) -> Callable[..., Alignmen
             representation_scale=alignment.representation_scale,
         )
         value_kl = transforms.categorical_kl(*jax.lax.stop_gradient((logits, prior_logits)))
-        parts = Alignment(loss, weight_of(kl, step), value_kl)
-        return jax.tree.map(lambda part: part * inference.has_prior, parts)
+        return Alignment(loss, weight_of(kl, step), value_kl)
 
     return value_alignment
 
@@ -87,12 +90,16 @@ def make_value_alignment(agent: Agent, config: Config) -> Callable[..., Alignmen
 def make_world_model_loss(agent: Agent, config: Config):
     """Eq. 2: prediction, dynamics and value alignment of a batch.
 
-    Gradients reach the world model only.
+    Gradients reach the world model only. The state that the world model carries is returned as
+    the batch leaves it.
     """
     model = config.world_model
     value_alignment = make_value_alignment(agent, config)
-    reward_bins = transforms.symexp_bins(model.bins)
-    discount = 1.0 - 1.0 / config.imagination.discount_horizon
+    reward_code = transforms.make_two_hot(model.bins, model.bin_spacing)
+    plain = model.continue_target == "plain"
+    discount = 1.0 if plain else discount_of(config)
+    of_batch = model.free_nats_of == "batch"
+    dynamics_loss = losses.batch_dynamics_loss if of_batch else losses.dynamics_loss
 
     def entropy(logits: Array) -> Array:
         """Of z_t, in nats, summed over its categoricals."""
@@ -100,33 +107,23 @@ def make_world_model_loss(agent: Agent, config: Config):
         return transforms.categorical_entropy(jax.lax.stop_gradient(mixed)).sum(-1)
 
     def loss_fn(
-        params: Params, slow_critic: PyTree, batch: Batch, key: Key, step: Array
-    ) -> tuple[Array, Inference, Metrics]:
-        steps = jax.tree.map(lambda x: x[:, 1:], batch.trajectory)
-        prev_action = batch.trajectory.action[:, :-1]
+        params: Params, state: PyTree, slow_critic: PyTree, batch: Batch, key: Key, step: Array
+    ) -> tuple[Array, tuple[Inference, PyTree, Metrics]]:
         # 1. Explain the batch: what is it, and what could have been predicted?
-        _, inference = agent.world_model.observe(
-            params.world_model,
-            key,
-            batch.context,
-            steps.obs,
-            prev_action,
-            steps.is_first,
-            train=True,
-        )
-        predictions = agent.world_model.predict(params.world_model, inference.latent)
+        explanation, state = agent.world_model.explain(params.world_model, state, key, batch)
+        inference, predictions, targets = explanation
         # 2. Maximum likelihood, Eq. 3.
         prediction = losses.prediction_loss(
             predictions.obs,
             predictions.reward,
             predictions.cont,
-            steps.obs,
-            steps.reward,
-            steps.is_terminal,
-            bins=reward_bins,
+            targets.obs,
+            reward_code.encode(targets.reward),
+            targets.is_terminal,
+            bins=reward_code.bins,
             discount=discount,
         )
-        dynamics, kl = losses.dynamics_loss(
+        dynamics, kl = dynamics_loss(
             inference.post_logits,
             inference.prior_logits,
             unimix=model.unimix,
@@ -157,63 +154,101 @@ def make_world_model_loss(agent: Agent, config: Config):
             "latent/posterior_entropy": jnp.mean(entropy(inference.post_logits)),
             "latent/prior_entropy": jnp.mean(entropy(inference.prior_logits)),
         }
-        return total(parts), inference, metrics
+        return total(parts), (inference, state, metrics)
 
     return loss_fn
 
 
+def discount_of(config: Config) -> float:
+    """gamma."""
+    return 1.0 - 1.0 / config.imagination.discount_horizon
+
+
 class Foresight(NamedTuple):
-    """H imagined steps from every state of a batch, `[H, N, ...]`, and what they promise."""
+    """H imagined steps from N states, `[H, N, ...]`, and what they promise."""
 
     latent: Latent  # that the actions left from
     action: Array  # [H, N, A]
     value_logits: Array  # [H, N, bins] of the online critic, the only field with a gradient
     returns: Array  # [H, N] lambda-returns, Eq. 7
+    slow_target: Array  # [H, N] the slow critic's value, or the lambda-returns of its values
     advantage: Array  # [H, N] in units of the return scale, Eq. 8
-    weight: Array  # [H, N] probability, by the continue head, of getting there
+    weight: Array  # [H, N] probability, by the continue head, of getting there; or 1
 
 
 def make_foresight(agent: Agent, config: Config):
-    """Build `foresight(params, scale, batch, inference, key) -> (Foresight, scale, metrics)`.
+    """Build `foresight(params, state, slow_critic, scale, inference, contexts, key)`.
 
-    Imagined latents carry no gradient, neither do the rewards, the continuation and the
-    values read from them.
+    It returns `(Foresight, scale, metrics)`. Imagined latents carry no gradient, neither do
+    the rewards, the continuation and the values read from them. Imagination begins where
+    `imagination.starts` says: at `inference`, or after the `contexts`, a `Batch`.
     """
-    imagination = config.imagination
-    reward_bins = transforms.symexp_bins(config.world_model.bins)
+    imagination, model = config.imagination, config.world_model
+    reward_code = transforms.make_two_hot(model.bins, model.bin_spacing)
     actor, critic, world_model = agent.actor, agent.critic, agent.world_model
+    horizon = imagination.horizon
+    undiscounted = model.continue_target == "plain"
+
+    def begin(params: PyTree, state: PyTree, inference: Inference, contexts: PyTree, key: Key):
+        if imagination.starts == "contexts":
+            # `imagine` takes one step more than it returns.
+            return world_model.follow(params, state, key, contexts, horizon=horizon + 1)[1]
+        assert world_model.starts is not None
+        return world_model.starts(params, state, inference)
+
+    def read_discount(logit: Array) -> Array:
+        """gamma * P(continue), or gamma where an episode is expected to go on, else 0."""
+        hard = imagination.continuation == "threshold"
+        cont = (logit > 0).astype(logit.dtype) if hard else jax.nn.sigmoid(logit)
+        if undiscounted:
+            return discount_of(config) * cont
+        return discount_of(config) * cont if hard else cont
+
+    def returns_of(reward: Array, discount: Array, value: Array) -> Array:
+        """`[H, N]` from what arrived with s_0..s_H and the values there."""
+        index = {"next": (value[1:], None), "current": (value[:-1], value[-1])}
+        mixed = index[imagination.value_index]
+        return returns.lambda_returns(
+            reward[1:], discount[1:], *mixed, lambda_=imagination.lambda_
+        )
+
+    def slow_target_of(params: PyTree, latent: Latent, reward: Array, discount: Array) -> Array:
+        if config.critic.slow_target == "returns":
+            value = critic.code.mean(critic.logits(params, latent))
+            return returns_of(reward, discount, value)
+        latent = jax.tree.map(lambda x: x[:-1], latent)
+        return critic.code.mean(critic.logits(params, latent))
 
     def foresight(
         params: Params,
+        state: PyTree,
+        slow_critic: PyTree,
         scale_state: returns.ReturnScale,
-        batch: Batch,
         inference: Inference,
+        contexts: PyTree,
         key: Key,
     ) -> tuple[Foresight, returns.ReturnScale, Metrics]:
         frozen = jax.lax.stop_gradient(params)
         key_starts, key_imagine = jax.random.split(key)
-        # 4. Imagine H steps from every state of the batch.
-        carry, start = world_model.starts(
-            frozen.world_model, key_starts, batch.trajectory, inference
-        )
+        # 4. Imagine H steps from every start.
+        carry, start = begin(frozen.world_model, state, inference, contexts, key_starts)
         imagined = imagine(
             world_model,
             lambda latent: actor.policy(frozen.actor, latent),
             frozen.world_model,
+            state,
             key_imagine,
             carry,
             start,
-            horizon=imagination.horizon,
+            horizon=horizon,
         )
         # 5. Lambda-returns and their scale, Eq. 7 and 9.
-        predictions = world_model.predict(frozen.world_model, imagined.latent)
-        reward = transforms.two_hot_mean(predictions.reward, reward_bins)
-        cont = jax.nn.sigmoid(predictions.cont)
+        predictions = world_model.predict(frozen.world_model, state, imagined.latent)
+        reward = reward_code.mean(predictions.reward)
+        discount = read_discount(predictions.cont)
         logits = critic.logits(params.critic, imagined.latent)
-        value = critic.mean(jax.lax.stop_gradient(logits))
-        target = returns.lambda_returns(
-            reward[1:], cont[1:], value[1:], lambda_=imagination.lambda_
-        )
+        value = critic.code.mean(jax.lax.stop_gradient(logits))
+        target = returns_of(reward, discount, value)
         scale_state = returns.update_return_scale(
             scale_state,
             target,
@@ -228,13 +263,15 @@ def make_foresight(agent: Agent, config: Config):
             "imagination/value": jnp.mean(value),
             "imagination/return_scale": scale,
         }
+        reach = losses.discount_weights(discount)[:-1]
         ahead = Foresight(
             latent=jax.tree.map(lambda x: x[:-1], imagined.latent),
             action=imagined.action[:-1],
             value_logits=logits[:-1],
             returns=target,
+            slow_target=slow_target_of(slow_critic, imagined.latent, reward, discount),
             advantage=(target - value[:-1]) / scale,
-            weight=losses.discount_weights(cont)[:-1],
+            weight=reach if imagination.reach_weights else jnp.ones_like(reach),
         )
         return ahead, scale_state, metrics
 
@@ -251,12 +288,12 @@ def make_behaviour_loss(agent: Agent, config: Config):
     actor, critic = agent.actor, agent.critic
     foresight = make_foresight(agent, config)
 
-    def critic_loss(logits: Array, slow_logits: Array, target: Array) -> Array:
+    def critic_loss(logits: Array, slow_target: Array, target: Array) -> Array:
         return losses.critic_loss(
             logits,
-            critic.mean(slow_logits),
-            target,
-            bins=critic.bins,
+            critic.code.encode(slow_target),
+            critic.code.encode(target),
+            bins=critic.code.bins,
             slow_scale=critic_config.slow_scale,
         )
 
@@ -269,44 +306,49 @@ def make_behaviour_loss(agent: Agent, config: Config):
             steps.is_last,
             steps.is_terminal,
             bootstrap,
-            discount=1.0 - 1.0 / config.imagination.discount_horizon,
+            discount=discount_of(config),
             lambda_=config.imagination.lambda_,
         )
         if not critic_config.replay_gradient:
             latent = jax.lax.stop_gradient(latent)
         logits = critic.logits(params.critic, latent)[:, :-1]
         slow_logits = critic.logits(slow_critic, jax.lax.stop_gradient(latent))[:, :-1]
-        return (1.0 - steps.is_last[:, :-1]) * critic_loss(logits, slow_logits, target)
+        slow_value = critic.code.mean(slow_logits)
+        return (1.0 - steps.is_last[:, :-1]) * critic_loss(logits, slow_value, target)
 
     def loss_fn(
         params: Params,
+        state: PyTree,
         slow_critic: PyTree,
         scale_state: returns.ReturnScale,
         batch: Batch,
         inference: Inference,
+        contexts: PyTree,
         key: Key,
-    ) -> tuple[Array, returns.ReturnScale, Metrics]:
-        ahead, scale_state, metrics = foresight(params, scale_state, batch, inference, key)
+    ) -> tuple[Array, tuple[returns.ReturnScale, Metrics]]:
+        ahead, scale_state, metrics = foresight(
+            params, state, slow_critic, scale_state, inference, contexts, key
+        )
         # 6. Critic and actor, Eq. 7 and 8; the critic also from replay.
         policy = actor.policy(params.actor, ahead.latent)
         log_prob, entropy = policy.log_prob(ahead.action), policy.entropy()
         actor_loss = losses.actor_loss(
             log_prob, entropy, ahead.advantage, entropy_scale=actor_config.entropy_scale
         )
-        slow_logits = critic.logits(slow_critic, ahead.latent)
-        imagined_loss = critic_loss(ahead.value_logits, slow_logits, ahead.returns)
-        steps = jax.tree.map(lambda x: x[:, 1:], batch.trajectory)
-        bootstrap = ahead.returns[0].reshape(steps.reward.shape)
-        replayed_loss = replay_critic_loss(
-            params, slow_critic, steps, inference.latent, bootstrap
-        )
+        imagined_loss = critic_loss(ahead.value_logits, ahead.slow_target, ahead.returns)
         parts = {
             "loss/actor": actor_config.scale * ahead.weight * actor_loss,
             "loss/critic": critic_config.scale * ahead.weight * imagined_loss,
-            "loss/replay_critic": critic_config.replay_scale * replayed_loss,
         }
+        if critic_config.replay_scale:
+            steps = jax.tree.map(lambda x: x[:, 1:], batch.trajectory)
+            bootstrap = ahead.returns[0].reshape(steps.reward.shape)
+            replayed_loss = replay_critic_loss(
+                params, slow_critic, steps, inference.latent, bootstrap
+            )
+            parts["loss/replay_critic"] = critic_config.replay_scale * replayed_loss
         parts = {name: jnp.mean(part) for name, part in parts.items()}
         metrics = parts | metrics | {"policy/entropy": jnp.mean(entropy)}
-        return total(parts), scale_state, metrics
+        return total(parts), (scale_state, metrics)
 
     return loss_fn

@@ -1,14 +1,14 @@
-"""LaProp after per-tensor adaptive gradient clipping: one optimiser for all parameters."""
+"""The optimisers: LaProp after per-tensor adaptive gradient clipping, and clipped Adam."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
 
-from vawm.config import OptimizerConfig
+from vawm.config import AdamConfig, LaPropConfig
 
 
 def adaptive_gradient_clip(clip: float, floor: float) -> optax.GradientTransformation:
@@ -56,8 +56,8 @@ def laprop(
     )
 
 
-def make_optimizer(config: OptimizerConfig) -> optax.GradientTransformation:
-    """Clipping, then LaProp with the learning rate rising from 0 over the warm-up.
+def make_laprop(config: LaPropConfig) -> optax.GradientTransformation:
+    """For all parameters: clipping, then LaProp, its rate rising from 0 over the warm-up.
 
     The very first update has learning rate 0; update number `warmup_updates`, counted from
     0, is the first at the full rate.
@@ -68,6 +68,30 @@ def make_optimizer(config: OptimizerConfig) -> optax.GradientTransformation:
     return optax.chain(
         adaptive_gradient_clip(config.agc, config.agc_floor),
         laprop(rate, config.beta1, config.beta2, config.epsilon),
+    )
+
+
+class Adams(NamedTuple):
+    """One optimiser for the world model, one for actor and critic together."""
+
+    world_model: optax.GradientTransformation
+    behaviour: optax.GradientTransformation
+
+
+def make_adams(config: AdamConfig) -> Adams:
+    """Adam after clipping by the global norm, as `torch.nn.utils.clip_grad_norm_` has it."""
+
+    def adam(learning_rate: float, clip: float, epsilon: float) -> optax.GradientTransformation:
+        return optax.chain(
+            optax.clip_by_global_norm(clip),
+            optax.adam(learning_rate, b1=config.beta1, b2=config.beta2, eps=epsilon),
+        )
+
+    return Adams(
+        world_model=adam(config.learning_rate, config.clip, config.epsilon),
+        behaviour=adam(
+            config.behaviour_learning_rate, config.behaviour_clip, config.behaviour_epsilon
+        ),
     )
 
 

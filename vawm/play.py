@@ -20,7 +20,7 @@ from vawm import envs
 from vawm.envs.host.vision import to_actuator
 from vawm.envs.protocol import Environment, HostEnvironment
 from vawm.policy import Policy
-from vawm.types import Array, TimeStep
+from vawm.types import Array, Params, PyTree, TimeStep
 
 How = Literal["sample", "mode"]
 
@@ -66,8 +66,12 @@ class Loop(NamedTuple):
 
 
 def player(env: Environment, policy: Policy, how: How = "sample") -> jax.stages.Wrapped:
-    """`(params, key) -> returns`, jitted: the same program for every checkpoint of a run."""
-    return jax.jit(lambda params, key: on_device(env, policy._replace(params=params), key, how))
+    """`(params, state, key) -> returns`, jitted: one program for every checkpoint of a run."""
+
+    def play(params: Params, state: PyTree, key: Array) -> Array:
+        return on_device(env, policy._replace(params=params, state=state), key, how)
+
+    return jax.jit(play)
 
 
 def on_device(env: Environment, policy: Policy, key: Array, how: How = "sample") -> Array:

@@ -11,7 +11,7 @@ import jax
 from vawm import checkpoint
 from vawm.agent import PolicyCarry, make_agent
 from vawm.config import Config
-from vawm.types import Array, EnvSpec, Key, Params, TimeStep
+from vawm.types import Array, EnvSpec, Key, Params, PyTree, TimeStep
 
 
 class Policy(NamedTuple):
@@ -22,15 +22,17 @@ class Policy(NamedTuple):
       spec: of the environment it was trained in.
       env_steps: when the checkpoint was written.
       params: the parameters.
+      state: what the world model carries beside them.
       initial: `(batch_size) -> carry`, before the first observation.
-      apply: `(params, key, carry, timestep, *, how) -> (carry, action [N, A])`, jitted and
-        pure.
+      apply: `(params, state, key, carry, timestep, *, how) -> (carry, action [N, A])`,
+        jitted and pure.
     """
 
     config: Config
     spec: EnvSpec
     env_steps: int
     params: Params
+    state: PyTree
     initial: Callable[[int], PolicyCarry]
     apply: Callable[..., tuple[PolicyCarry, Array]]
 
@@ -42,11 +44,11 @@ class Policy(NamedTuple):
         how: Literal["sample", "mode"] = "sample",
     ) -> tuple[PolicyCarry, Array]:
         """The next carry and a raw action `[N, A]`: sampled, or the policy's mode."""
-        return self.apply(self.params, key, carry, timestep, how=how)
+        return self.apply(self.params, self.state, key, carry, timestep, how=how)
 
 
 def load(logdir: str | os.PathLike[str]) -> Policy:
-    """The policy in `logdir`; only its parameters are read.
+    """The policy in `logdir`; only what acting needs is read.
 
     Raises:
       InvalidInput: there is no checkpoint, or it is damaged.
@@ -54,12 +56,13 @@ def load(logdir: str | os.PathLike[str]) -> Policy:
     _, manifest = checkpoint.read_manifest(logdir)
     agent = make_agent(manifest.config, manifest.spec)
     target = jax.eval_shape(agent.init, jax.random.key(0))
-    params, manifest = checkpoint.restore_params(logdir, target)
+    (params, state), manifest = checkpoint.restore_agent(logdir, *target)
     return Policy(
         config=manifest.config,
         spec=manifest.spec,
         env_steps=manifest.env_steps,
         params=params,
+        state=state,
         initial=agent.initial,
         apply=jax.jit(agent.act, static_argnames="how"),
     )

@@ -1,4 +1,4 @@
-"""Values of `Config` by suite and name: the paper's setting, and small ones for a CPU."""
+"""Values of `Config` by agent, suite and name: the paper's, and small ones for a CPU."""
 
 from __future__ import annotations
 
@@ -6,12 +6,17 @@ import dataclasses
 from typing import Any
 
 from vawm.config import (
+    ActorConfig,
+    AdamConfig,
     AtariConfig,
     Config,
+    CriticConfig,
+    EnvConfig,
     GymnasiumConfig,
     ImaginationConfig,
-    OptimizerConfig,
+    LaPropConfig,
     ReplayConfig,
+    StormConfig,
     ValueAlignmentConfig,
     VideoConfig,
     VisionConfig,
@@ -31,7 +36,7 @@ QUICK = dataclasses.replace(
     save_every=24_000,
     imagination=ImaginationConfig(discount_horizon=150.0),
     value_alignment=ValueAlignmentConfig(warmup_steps=7_200),
-    optimizer=OptimizerConfig(learning_rate=6e-4, warmup_updates=300),
+    optimizer=LaPropConfig(learning_rate=6e-4, warmup_updates=300),
     replay=ReplayConfig(batch_size=8, batch_length=32),
 )
 """For a CPU with 2 cores: steps in the simulation cost little there and updates much, so it
@@ -117,10 +122,102 @@ GYMNASIUM_PIXELS = dataclasses.replace(
 )
 """As quick, for images: an update takes several times as long, so there are fewer."""
 
+STORM = Config(
+    suite="atari100k",
+    task="breakout",
+    agent="storm",
+    size="16m",
+    env_steps=408_000,
+    num_envs=1,
+    action_repeat=4,
+    train_ratio=1024,
+    random_steps=4_096,
+    save_every=40_000,
+    world_model=StormConfig(),
+    actor=ActorConfig(layers=2, units=512, network="storm", unimix=0.0, entropy_scale=3e-4),
+    critic=CriticConfig(
+        layers=2,
+        units=512,
+        network="storm",
+        bin_spacing="symlog",
+        slow_target="returns",
+        replay_scale=0.0,
+    ),
+    imagination=ImaginationConfig(
+        horizon=16,
+        discount_horizon=200 / 3,
+        starts="contexts",
+        value_index="current",
+        continuation="threshold",
+        reach_weights=False,
+    ),
+    value_alignment=ValueAlignmentConfig(warmup_steps=40_000),
+    optimizer=AdamConfig(),
+    replay=ReplayConfig(capacity=100_000),
+    video=VideoConfig(every=40_000),
+    env=AtariConfig(resize="area", noops=0, sticky=0.25, life_loss="terminal"),
+)
+"""STORM as its official code has it: 102,000 agent steps of 4 frames, of which the first 1,024
+are random; one update of everything for each. Table 14, and what it leaves out."""
+
+STORM_QUICK = dataclasses.replace(
+    with_size(STORM, "1m"),
+    suite="dmc_proprio",
+    task="cartpole_swingup",
+    preset="quick",
+    env_steps=QUICK.env_steps,
+    num_envs=QUICK.num_envs,
+    action_repeat=QUICK.action_repeat,
+    train_ratio=QUICK.train_ratio,
+    random_steps=0,
+    log_every=QUICK.log_every,
+    save_every=QUICK.save_every,
+    imagination=dataclasses.replace(
+        STORM.imagination,
+        batch_size=256,
+        discount_horizon=QUICK.imagination.discount_horizon,
+    ),
+    value_alignment=QUICK.value_alignment,
+    optimizer=AdamConfig(learning_rate=6e-4, behaviour_learning_rate=3e-4),
+    replay=QUICK.replay,
+    video=VideoConfig(),
+    env=EnvConfig(),
+)
+"""For a CPU with 2 cores, as `QUICK`; the paper has no STORM that reads vectors."""
+
+
+def small_storm(like: Config) -> Config:
+    """STORM's small updates, in the run that `like` is for DreamerV3."""
+    taken = ("agent", "size", "world_model", "actor", "critic", "imagination", "optimizer")
+    return dataclasses.replace(like, **{name: getattr(STORM_QUICK, name) for name in taken})
+
+
 PRESETS = {
-    "dmc_proprio": {"quick": QUICK, "paper": PAPER},
-    "dmc_vision": {"quick": VISION_QUICK, "paper": VISION_PAPER},
-    "atari100k": {"quick": ATARI_QUICK, "paper": ATARI_PAPER},
-    "gymnasium": {"quick": GYMNASIUM_QUICK, "pixels": GYMNASIUM_PIXELS},
+    "dreamerv3": {
+        "dmc_proprio": {"quick": QUICK, "paper": PAPER},
+        "dmc_vision": {"quick": VISION_QUICK, "paper": VISION_PAPER},
+        "atari100k": {"quick": ATARI_QUICK, "paper": ATARI_PAPER},
+        "gymnasium": {"quick": GYMNASIUM_QUICK, "pixels": GYMNASIUM_PIXELS},
+    },
+    "storm": {
+        "dmc_proprio": {"quick": STORM_QUICK},
+        "dmc_vision": {"quick": small_storm(VISION_QUICK)},
+        "atari100k": {
+            "quick": dataclasses.replace(small_storm(ATARI_QUICK), env=STORM.env),
+            "paper": STORM,
+        },
+        "gymnasium": {
+            "quick": small_storm(GYMNASIUM_QUICK),
+            "pixels": dataclasses.replace(
+                small_storm(GYMNASIUM_PIXELS),
+                actor=dataclasses.replace(STORM_QUICK.actor, unimix=0.01, entropy_scale=3e-3),
+            ),
+        },
+    },
 }
-"""Suite -> name -> config."""
+"""Agent -> suite -> name -> config."""
+
+
+def of(config: Config) -> dict[str, Config]:
+    """The presets of this agent in this suite, by name."""
+    return PRESETS[config.agent][config.suite]

@@ -87,7 +87,7 @@ def on_device(env: Environment, agent: Agent, config: Config) -> Program:
 def on_host(env: HostEnvironment, agent: Agent, config: Config) -> Program:
     """The same update around environments on the host."""
     spec, seed = env.spec, config.seed
-    begin = jax.jit(functools.partial(host_train.init, spec, agent, config))
+    begin = jax.jit(functools.partial(host_train.init, agent, config))
     shapes = begin.eval_shape(jax.random.key(0), host_train.first_timestep(spec))
     images: Callable[[], PyTree] = tuple
     if config.replay.images == "host":

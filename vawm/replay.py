@@ -2,8 +2,9 @@
 
 Every leaf is `[N, C, ...]`: N streams, one per environment, of C steps each. A sample is
 a run of consecutive steps of one stream, free to cross episode ends, never the write
-head. Beside each step lies the latent that the agent inferred there; a sample starts from
-the one at its first step, and the learner writes the latents that it infers back.
+head. Beside each step lies the latent that the agent inferred there, if its world model has a
+use for it; a sample starts from the one at its first step, and the learner writes the latents
+that it infers back. In the place of latents that nobody needs is `()`.
 """
 
 from __future__ import annotations
@@ -14,12 +15,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vawm.types import Array, EnvSpec, Key, Latent, Trajectory
+from vawm.types import Array, Batch, EnvSpec, Key, Latent, Trajectory
+
+Stored = Latent | tuple[()]
+"""Latents, or nothing."""
 
 
 class Replay(NamedTuple):
     trajectory: Trajectory  # [N, C, ...]
-    latent: Latent  # deter [N, C, D]; stoch as class indices [N, C, S] uint8
+    latent: Stored  # deter [N, C, D]; stoch as class indices [N, C, S] uint8
     head: Array  # [] int32, where the next step is written
     size: Array  # [] int32, steps held in each stream
 
@@ -48,7 +52,7 @@ def capacity_per_env(
     return max(1, min(capacity // spec.num_envs, collected))
 
 
-def init(example: Trajectory, latent: Latent, *, capacity: int) -> Replay:
+def init(example: Trajectory, latent: Stored, *, capacity: int) -> Replay:
     """An empty buffer for steps like `example` and `latent`, each `[N, ...]`."""
 
     def empty(x):
@@ -62,19 +66,23 @@ def init(example: Trajectory, latent: Latent, *, capacity: int) -> Replay:
     )
 
 
-def pack(latent: Latent) -> Latent:
+def pack(latent: Stored) -> Stored:
     """One-hot classes as their indices: exact, and a byte instead of K floats."""
+    if not isinstance(latent, Latent):
+        return ()
     return latent._replace(stoch=jnp.argmax(latent.stoch, -1).astype(jnp.uint8))
 
 
-def unpack(latent: Latent, classes: int) -> Latent:
+def unpack(latent: Stored, classes: int) -> Stored:
     """Inverse of `pack`."""
+    if not isinstance(latent, Latent):
+        return ()
     return latent._replace(
         stoch=jax.nn.one_hot(latent.stoch, classes, dtype=latent.deter.dtype)
     )
 
 
-def add(replay: Replay, trajectory: Trajectory, latent: Latent) -> Replay:
+def add(replay: Replay, trajectory: Trajectory, latent: Stored) -> Replay:
     """Append K steps `[N, K, ...]` to every stream; the oldest are overwritten."""
     capacity = replay.trajectory.reward.shape[1]
     length = trajectory.reward.shape[1]
@@ -130,22 +138,18 @@ def draw_on_host(
     return Positions(env.astype(np.int32), time.astype(np.int32))
 
 
-def read(replay: Replay, positions: Positions, *, classes: int) -> tuple[Trajectory, Latent]:
-    """What lies at `positions`.
-
-    Returns:
-      The trajectories `[B, L, ...]` and the stored latents of their first steps `[B, ...]`.
-    """
+def read(replay: Replay, positions: Positions, *, classes: int) -> Batch:
+    """What lies at `positions`: `[B, L, ...]`, and the stored latents of their first steps."""
     env, time = positions
     trajectory = jax.tree.map(lambda x: x[env[:, None], time], replay.trajectory)
     context = jax.tree.map(lambda x: x[env, time[:, 0]], replay.latent)
     # An episode that a reset cut short has no last step of its own.
     abandoned = jnp.pad(trajectory.is_first[:, 1:], ((0, 0), (0, 1)))
     trajectory = trajectory._replace(is_last=trajectory.is_last | abandoned)
-    return trajectory, unpack(context, classes)
+    return Batch(trajectory, unpack(context, classes))
 
 
-def write_back(replay: Replay, positions: Positions, latent: Latent) -> Replay:
+def write_back(replay: Replay, positions: Positions, latent: Stored) -> Replay:
     """Replace the stored latents at `positions` by newer ones, `[B, L, ...]`."""
 
     def write(buffer, x):

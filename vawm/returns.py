@@ -11,7 +11,14 @@ import jax.numpy as jnp
 Array = jax.Array
 
 
-def lambda_returns(reward: Array, discount: Array, value: Array, *, lambda_: float) -> Array:
+def lambda_returns(
+    reward: Array,
+    discount: Array,
+    value: Array,
+    bootstrap: Array | None = None,
+    *,
+    lambda_: float,
+) -> Array:
     """Bootstrapped lambda-returns, Eq. 7.
 
         R_t = r_{t+1} + d_{t+1} * ((1 - lambda) * v_{t+1} + lambda * R_{t+1})
@@ -24,19 +31,22 @@ def lambda_returns(reward: Array, discount: Array, value: Array, *, lambda_: flo
       reward: `[H, ...]` rewards r_1..r_H, in environment units (not symlog).
       discount: `[H, ...]` gamma * P(continue) at s_1..s_H, in [0, 1].
       value: `[H, ...]` critic means v_1..v_H, in environment units.
+      bootstrap: `[...]` v_H where `value` is indexed otherwise: STORM's official code mixes in
+        v_t in the place of v_{t+1}, and passes v_0..v_{H-1} as `value`.
       lambda_: mixing weight; 0 is one-step TD, 1 is Monte Carlo.
 
     Returns:
       `[H, ...]` returns R_0..R_{H-1}. Gradients are not stopped here.
     """
     chex.assert_equal_shape([reward, discount, value])
+    last = value[-1] if bootstrap is None else bootstrap
 
     def backward(next_return, step):
         r, d, v = step
         r = r + d * ((1 - lambda_) * v + lambda_ * next_return)
         return r, r
 
-    _, returns = jax.lax.scan(backward, value[-1], (reward, discount, value), reverse=True)
+    _, returns = jax.lax.scan(backward, last, (reward, discount, value), reverse=True)
     return returns
 
 

@@ -18,9 +18,10 @@ from vawm.agent import Agent
 from vawm.collector import Collector, begin, make_collect
 from vawm.config import Config
 from vawm.envs.protocol import Environment
-from vawm.learner import Learner, init_learner, make_learn
+from vawm.learn import make_learn
+from vawm.learner import Learner, init_learner
 from vawm.replay import Replay
-from vawm.types import Array, EnvSpec, Key, Metrics, PyTree, Trajectory
+from vawm.types import Array, Key, Metrics, PyTree, Trajectory
 
 
 class TrainState(NamedTuple):
@@ -59,7 +60,11 @@ def make_train_step(env: Environment, agent: Agent, config: Config) -> TrainStep
     def train_step(state: TrainState) -> tuple[TrainState, Metrics]:
         key, key_collect, key_learn = jax.random.split(state.key, 3)
         collector, buffer, collected = collect(
-            state.learner.params, state.collector, state.replay, key_collect
+            state.learner.params,
+            state.learner.model_state,
+            state.collector,
+            state.replay,
+            key_collect,
         )
         ready = replay.num_starts(buffer, length + 1) >= batch_steps
         credit = state.credit + jnp.where(ready, earned, 0)
@@ -93,22 +98,23 @@ def init(env: Environment, agent: Agent, config: Config, key: Key) -> TrainState
     return TrainState(
         learner=init_learner(agent, config, key_learner),
         collector=collector,
-        replay=empty_replay(env.spec, collector, config),
+        replay=empty_replay(agent, collector, config),
         credit=jnp.zeros((), jnp.int32),
         key=key,
     )
 
 
-def empty_replay(spec: EnvSpec, collector: Collector, config: Config) -> Replay:
+def empty_replay(agent: Agent, collector: Collector, config: Config) -> Replay:
     """Replay for what `collector` will store; never more than the run collects."""
     example = Trajectory(*collector.timestep, action=collector.carry.action)
     capacity = replay.capacity_per_env(
         config.replay.capacity,
-        spec,
+        agent.spec,
         env_steps=config.env_steps,
         collect_steps=config.collect_steps,
     )
-    return replay.init(example, collector.carry.latent, capacity=capacity)
+    kept = agent.world_model.memory(collector.carry.memory)
+    return replay.init(example, kept, capacity=capacity)
 
 
 SEED_AXES = TrainState(

@@ -6,7 +6,8 @@ exactly where they should. Everything here computes in float32, whatever the log
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Literal, NamedTuple
 
 import chex
 import jax
@@ -38,6 +39,40 @@ def symexp_bins(n: int) -> Array:
     upper = -lower[::-1]
     bins = np.concatenate([lower, upper[n % 2 :]]).astype(np.float32)
     return jnp.asarray(bins + 0.0)  # -0.0 becomes 0.0
+
+
+class TwoHot(NamedTuple):
+    """A two-hot code of real numbers.
+
+    Attributes:
+      bins: `[n]` increasing values that the classes stand for.
+      encode: `[...]` numbers -> `[...]` in the units of `bins`; targets of a cross-entropy.
+      mean: `[..., n]` logits -> `[...]` numbers, the inverse of `encode` at the mean.
+    """
+
+    bins: Array
+    encode: Callable[[Array], Array]
+    mean: Callable[[Array], Array]
+
+
+def make_two_hot(n: int, spacing: Literal["symexp", "symlog"]) -> TwoHot:
+    """A code of `n` bins that reaches +-symexp(20).
+
+    "symexp", as in DreamerV3: bins are numbers, spaced by symexp, and a mean is one of numbers.
+    "symlog", as in STORM: bins are symlogs, evenly spaced, and a mean is one of symlogs, which
+    is decoded then: where classes disagree, that is nearer to 0.
+    """
+    if spacing == "symexp":
+        bins = symexp_bins(n)
+        return TwoHot(bins, lambda y: y, lambda logits: two_hot_mean(logits, bins))
+    bins = jnp.linspace(-20.0, 20.0, n)
+
+    def mean(logits: Array) -> Array:
+        # Not a product, which accelerators would round to fewer bits.
+        probs = jax.nn.softmax(logits.astype(jnp.float32))
+        return symexp((probs * jnp.expand_dims(bins, tuple(range(logits.ndim - 1)))).sum(-1))
+
+    return TwoHot(bins, symlog, mean)
 
 
 def two_hot(y: Array, bins: Array) -> Array:

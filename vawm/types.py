@@ -103,17 +103,16 @@ class Latent(NamedTuple):
 
 
 class Inference(NamedTuple):
-    """What a world model infers from a batch, `[B, T, ...]`.
+    """States that a world model has both inferred and predicted, `[B, T, ...]`.
 
-    `latent` and `prior_latent` share h_t; their z_t is drawn from q(z|h,o) and p(z|h).
-    Logits are before unimix. `has_prior` is False where no prediction of z_t exists.
+    `latent` and `prior_latent` share h_t; their z_t is drawn from the posterior and from the
+    prior. Logits are before unimix.
     """
 
     latent: Latent
     prior_latent: Latent
     post_logits: Array  # [B, T, S, K]
     prior_logits: Array  # [B, T, S, K]
-    has_prior: Array  # [B, T] bool
 
 
 class Imagined(NamedTuple):
@@ -127,8 +126,39 @@ class Predictions(NamedTuple):
     """What the heads read from a latent, any leading dims."""
 
     obs: PyTree  # as EnvSpec.obs: symlog units for vectors, [0, 1] for images
-    reward: Array  # [..., bins] logits of the symexp two-hot
-    cont: Array  # [...] logit of discount * P(not terminal)
+    reward: Array  # [..., bins] logits of the two-hot code
+    cont: Array  # [...] logit of P(not terminal), times the discount where that is learned too
+
+
+class Explanation(NamedTuple):
+    """What a world model makes of a batch: what it inferred, and what its heads read there.
+
+    Which steps have what depends on the model: `predictions` and `targets` agree entry by
+    entry, and each field of theirs may cover other steps than `inference` does.
+    """
+
+    inference: Inference
+    predictions: Predictions
+    targets: Targets
+
+
+class Targets(NamedTuple):
+    """What arrived, where `Predictions` says what should have."""
+
+    obs: PyTree
+    reward: Array
+    is_terminal: Array
+
+
+class Batch(NamedTuple):
+    """Sequences of experience: T + 1 steps, the first of which only gives context.
+
+    What that is depends on the world model: the latent that was stored beside the first step,
+    or the step itself.
+    """
+
+    trajectory: Trajectory  # [B, T + 1, ...]
+    context: PyTree  # [B, ...] what replay keeps beside step 0; () for nothing
 
 
 class Params(NamedTuple):

@@ -13,12 +13,12 @@ import jax
 
 from vawm import config as config_lib
 from vawm import presets
-from vawm.config import AtariConfig, Config, VisionConfig
+from vawm.config import AtariConfig, Config, RSSMConfig, StormConfig, VisionConfig
 from vawm.envs import EPISODE_STEPS
 from vawm.envs.host.frames import check_smaller
 from vawm.errors import InvalidInput
 from vawm.types import EnvSpec, is_image
-from vawm.world_model.heads import check_image_size
+from vawm.world_model.codecs import check_image_size
 
 Rule = tuple[Callable[[Any], bool], str]
 
@@ -34,6 +34,7 @@ CLASSES: Rule = (lambda x: 2 <= x <= 256, "use a number from 2 to 256")
 
 RULES: dict[str, Rule] = {
     "seed": (lambda x: 0 <= x < 2**32, "use a number from 0 to 4294967295"),
+    "random_steps": NOT_NEGATIVE,
     "world_model.stoch": POSITIVE,
     "world_model.classes": CLASSES,
     "world_model.bins": BINS,
@@ -42,6 +43,7 @@ RULES: dict[str, Rule] = {
     "world_model.reconstruction_scale": NOT_NEGATIVE,
     "world_model.dynamics_scale": NOT_NEGATIVE,
     "world_model.representation_scale": NOT_NEGATIVE,
+    "world_model.dropout": BELOW_ONE,
     "actor.unimix": BELOW_ONE,
     "actor.scale": NOT_NEGATIVE,
     "actor.entropy_scale": NOT_NEGATIVE,
@@ -56,6 +58,7 @@ RULES: dict[str, Rule] = {
     "critic.slow_scale": NOT_NEGATIVE,
     "critic.replay_scale": NOT_NEGATIVE,
     "imagination.lambda_": SHARE,
+    "imagination.context_length": SEQUENCE,
     "imagination.discount_horizon": ABOVE_ONE,
     "imagination.return_scale_decay": BELOW_ONE,
     "imagination.return_scale_low": SHARE,
@@ -129,8 +132,10 @@ def _check_number(name: str, value: Any, kind: type) -> None:
 
 
 def _check_together(config: Config) -> None:
+    _check_agent(config)
     _check_names(config)
     _check_widths(config)
+    _check_imagination(config)
     _check_replay(config)
     _check_counters(config)
     _check_env(config)
@@ -143,11 +148,19 @@ def _check_together(config: Config) -> None:
         raise InvalidInput("imagination.return_scale_low", scale.return_scale_low, remedy)
 
 
+def _check_agent(config: Config) -> None:
+    """An agent has the choices of its own kind."""
+    for name, kind in config_lib.AGENT_CONFIGS[config.agent]._asdict().items():
+        if type(getattr(config, name)) is not kind:
+            remedy = f"agent {config.agent} takes a {kind.__name__}"
+            raise InvalidInput(name, type(getattr(config, name)).__name__, remedy)
+
+
 def _check_names(config: Config) -> None:
     """Preset and size are known, and a size is not the name of other widths than its own."""
-    known = presets.PRESETS[config.suite]
-    check_choice("preset", config.preset, [*known, config_lib.CUSTOM])
-    check_choice("size", config.size, [*config_lib.SIZES, config_lib.CUSTOM])
+    check_choice("preset", config.preset, [*presets.of(config), config_lib.CUSTOM])
+    sizes = config_lib.SIZES[config.agent]
+    check_choice("size", config.size, [*sizes, config_lib.CUSTOM])
     if config.size == config_lib.CUSTOM:
         return
     widths = dict(values(config_lib.with_size(config, config.size)))
@@ -162,12 +175,54 @@ def _check_names(config: Config) -> None:
 
 def _check_widths(config: Config) -> None:
     model = config.world_model
+    if isinstance(model, StormConfig):
+        if model.deter % model.heads:
+            remedy = f"use a multiple of world_model.heads={model.heads}"
+            raise InvalidInput("world_model.deter", model.deter, remedy)
+        return
+    assert isinstance(model, RSSMConfig)
     if model.deter % model.blocks:
         remedy = f"use a multiple of world_model.blocks={model.blocks}"
         raise InvalidInput("world_model.deter", model.deter, remedy)
     if 4 * model.depth % model.blocks:  # channels of the map that the decoder starts from
         remedy = f"use one of which 4 times is a multiple of world_model.blocks={model.blocks}"
         raise InvalidInput("world_model.depth", model.depth, remedy)
+
+
+def _check_imagination(config: Config) -> None:
+    """Where imagination starts, and what depends on it."""
+    imagination, model = config.imagination, config.world_model
+    from_contexts = imagination.starts == "contexts"
+    if from_contexts and config.critic.replay_scale:
+        remedy = "use 0: its returns begin at posteriors, imagination at contexts"
+        raise InvalidInput("critic.replay_scale", config.critic.replay_scale, remedy)
+    if from_contexts and imagination.context_length > config.replay.batch_length:
+        remedy = f"use at most replay.batch_length={config.replay.batch_length}"
+        raise InvalidInput("imagination.context_length", imagination.context_length, remedy)
+    if not isinstance(model, StormConfig):
+        return
+    if not from_contexts:
+        remedy = "use contexts: a transformer has no state to start from but its past"
+        raise InvalidInput("imagination.starts", imagination.starts, remedy)
+    lengths = {
+        "replay.batch_length": config.replay.batch_length,
+        "world_model.act_context": model.act_context,
+        "imagination.horizon": imagination.context_length + imagination.horizon,
+    }
+    for name, length in lengths.items():
+        if length > model.positions:
+            beyond = f" after {imagination.context_length} of context" * name.endswith(
+                "horizon"
+            )
+            remedy = (
+                f"a sequence of {length}{beyond} has no position in the transformer: use less, "
+                f"or more world_model.positions than {model.positions}"
+            )
+            raise InvalidInput(name, _get(config, name), remedy)
+
+
+def _get(config: Config, name: str) -> Any:
+    return dict(values(config))[name]
 
 
 def _first_update(config: Config) -> int:
@@ -210,7 +265,7 @@ def _check_replay(config: Config) -> None:
 
 def _usual(config: Config) -> Config:
     """The preset of this run; that of the paper where it has none of its own."""
-    return presets.PRESETS[config.suite].get(config.preset, presets.PAPER)
+    return presets.of(config).get(config.preset, presets.PAPER)
 
 
 def _blame_batch(config: Config) -> None:
@@ -331,12 +386,13 @@ def check_images(config: Config, *, present: bool) -> None:
         raise InvalidInput("video.every", config.video.every, remedy)
 
 
-def preset(suite: str, name: str, size: str | None = None) -> Config:
+def preset(agent: str, suite: str, name: str, size: str | None = None) -> Config:
     """The config of a preset, at another size where one is given."""
-    check_choice("suite", suite, presets.PRESETS)
-    known = presets.PRESETS[suite]
+    check_choice("agent", agent, presets.PRESETS)
+    check_choice("suite", suite, presets.PRESETS[agent])
+    known = presets.PRESETS[agent][suite]
     check_choice("preset", name, known)
     if size is None:
         return known[name]
-    check_choice("size", size, config_lib.SIZES)
+    check_choice("size", size, config_lib.SIZES[agent])
     return config_lib.with_size(known[name], size)

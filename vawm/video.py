@@ -16,12 +16,11 @@ from PIL import Image
 
 from vawm import image_store, replay
 from vawm.config import Config
-from vawm.objective import Batch
 from vawm.open_loop import make_open_loop
 from vawm.program import Program
 from vawm.replay import Positions
 from vawm.train import TrainState
-from vawm.types import PyTree, is_image
+from vawm.types import Batch, PyTree, is_image
 
 FRAMES_PER_SECOND = 20
 BORDER = 2  # pixels
@@ -55,13 +54,12 @@ def make(program: Program, config: Config) -> Callable[[TrainState], list[Video]
     look_up = jax.jit(lambda buffer, at: replay.read(buffer, at, classes=classes))
 
     def look(state: TrainState, positions: Positions) -> Batch:
-        trajectory, context = look_up(state.replay, positions)
         images = image_store.read(state.images, positions) if on_host else ()
-        obs = image_store.merge(trajectory.obs, images)
-        return Batch(trajectory._replace(obs=obs), context)
+        return image_store.complete(look_up(state.replay, positions), images)
 
     def film(state: TrainState) -> list[Video]:
-        buffer, env_steps = state.replay, int(state.collector.env_steps)
+        learner, buffer = state.learner, state.replay
+        env_steps = int(state.collector.env_steps)
         num_envs, capacity = buffer.trajectory.reward.shape
         head, size = int(buffer.head), int(buffer.size)
         length, videos = config.replay.batch_length + 1, []
@@ -74,7 +72,9 @@ def make(program: Program, config: Config) -> Callable[[TrainState], list[Video]
             )
             batch = look(state, positions)
             key = jax.random.fold_in(jax.random.key(config.seed), env_steps)
-            predicted, same = jax.device_get(predict(state.learner.params, key, batch))
+            predicted, same = jax.device_get(
+                predict(learner.params, learner.model_state, key, batch)
+            )
             truth = jax.device_get(jax.tree.map(lambda x: x[:, 1:], batch.trajectory.obs))
             videos.append(open_loop_video(truth, predicted, same, context=choices.context))
         times = last_episode(

@@ -4,7 +4,7 @@ Equation numbers are the paper's. Every loss is per element; masks, weights and 
 caller's.
 
     prediction_loss, symlog_mse, image_mse, continue_loss     Eq. 3a  what the heads predict
-    dynamics_loss                                             Eq. 3b  prior and posterior
+    dynamics_loss, batch_dynamics_loss, balanced_kl           Eq. 3b  prior and posterior
     value_alignment_loss                                      Eq. 4   values under both
     value_alignment_weight                                    Eq. 5   its adaptive weight
     critic_loss                                               Eq. 7   towards lambda-returns
@@ -14,6 +14,8 @@ caller's.
 from vawm.losses.behaviour import actor_loss, critic_loss, discount_weights
 from vawm.losses.likelihood import (
     PredictionLoss,
+    balanced_kl,
+    batch_dynamics_loss,
     continue_loss,
     dynamics_loss,
     image_mse,
@@ -25,6 +27,8 @@ from vawm.losses.value_alignment import value_alignment_loss, value_alignment_we
 __all__ = [
     "PredictionLoss",
     "actor_loss",
+    "balanced_kl",
+    "batch_dynamics_loss",
     "continue_loss",
     "critic_loss",
     "discount_weights",

@@ -13,29 +13,30 @@ Array = jax.Array
 
 def critic_loss(
     value_logits: Array,
-    slow_value: Array,
+    slow_target: Array,
     returns: Array,
     *,
     bins: Array,
     slow_scale: float,
 ) -> Array:
-    """Distributional value loss, Eq. 7, with the slow critic as a regulariser.
+    """Distributional value loss, Eq. 7, with a second target from the slow critic.
 
-        L = CE(V(s), twohot(R)) + slow_scale * CE(V(s), twohot(v_slow))
+        L = CE(V(s), twohot(R)) + slow_scale * CE(V(s), twohot(y_slow))
 
-    The second target is the slow critic's mean, encoded again, as in the official DreamerV3.
+    In the official DreamerV3 y_slow is the slow critic's mean, encoded again; in the official
+    STORM it is the lambda-return of the slow critic's values.
 
     Args:
       value_logits: `[..., bins]` critic logits at s_t.
-      slow_value: `[...]` mean of the slow critic at s_t, in environment units.
-      returns: `[...]` lambda-returns R_t, in environment units, not normalised.
-      bins: `[bins]` of the critic.
-      slow_scale: weight of the regulariser.
+      slow_target: `[...]` y_slow, in the units of `bins`.
+      returns: `[...]` lambda-returns R_t, in the units of `bins`, not normalised.
+      bins: `[bins]` of the critic: of values, or of their symlogs.
+      slow_scale: weight of the second target.
 
     Returns:
       `[...]` losses in nats. Both targets are stopped.
     """
-    to_returns, to_slow = two_hot_cross_entropies(value_logits, (returns, slow_value), bins)
+    to_returns, to_slow = two_hot_cross_entropies(value_logits, (returns, slow_target), bins)
     return to_returns + slow_scale * to_slow
 
 

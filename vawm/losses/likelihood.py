@@ -45,15 +45,15 @@ def prediction_loss(
       reward_logits: `[..., bins]`.
       cont_logit: `[...]`.
       obs: `[..., D]` floats in raw units, or `[..., H, W, C]` uint8; the same tree.
-      reward: `[...]` in environment units.
+      reward: `[...]` in the units of `bins`.
       is_terminal: `[...]` bool.
-      bins: `[bins]` of the reward head.
-      discount: gamma, which the continue head learns along with the end of episodes.
+      bins: `[bins]` of the reward head: of rewards, or of their symlogs.
+      discount: gamma, which the continue head learns along with the end of episodes; 1 where it
+        learns that alone.
     """
     chex.assert_equal_shape([cont_logit, reward, is_terminal])
     parts = jax.tree.map(reconstruction_loss, obs_prediction, obs)
     reconstruction = jax.tree.reduce(jnp.add, parts)
-    chex.assert_equal_shape([reconstruction, reward])
     return PredictionLoss(
         reconstruction=reconstruction,
         reward=two_hot_cross_entropy(reward_logits, reward, bins),
@@ -115,11 +115,44 @@ def dynamics_loss(
     Returns:
       `[...]` losses, and `[...]` the raw KL in nats, summed over the categoricals.
     """
+    dynamics, representation = balanced_kl(post_logits, prior_logits, unimix=unimix)
+    loss = dynamics_scale * jnp.maximum(free_nats, dynamics)
+    loss += representation_scale * jnp.maximum(free_nats, representation)
+    return loss, jax.lax.stop_gradient(dynamics)
+
+
+def batch_dynamics_loss(
+    post_logits: Array,
+    prior_logits: Array,
+    *,
+    unimix: float,
+    free_nats: float,
+    dynamics_scale: float,
+    representation_scale: float,
+) -> tuple[Array, Array]:
+    """As `dynamics_loss`, with the free nats of the mean over the batch: STORM's official code.
+
+        L = dynamics_scale * max(free, mean KL[sg q || p])
+            + representation_scale * max(free, mean KL[q || sg p])
+
+    Below the free nats no state has a gradient, however far its own prior is off.
+
+    Returns:
+      `[]` the loss, and `[...]` the raw KL in nats.
+    """
+    dynamics, representation = balanced_kl(post_logits, prior_logits, unimix=unimix)
+    loss = dynamics_scale * jnp.maximum(free_nats, dynamics.mean())
+    loss += representation_scale * jnp.maximum(free_nats, representation.mean())
+    return loss, jax.lax.stop_gradient(dynamics)
+
+
+def balanced_kl(
+    post_logits: Array, prior_logits: Array, *, unimix: float
+) -> tuple[Array, Array]:
+    """`[...]` KL[sg q || p] and KL[q || sg p], summed over the categoricals: equal numbers."""
     chex.assert_equal_shape([post_logits, prior_logits])
     stop = jax.lax.stop_gradient
     post, prior = unimix_logits(post_logits, unimix), unimix_logits(prior_logits, unimix)
     dynamics = categorical_kl(stop(post), prior).sum(-1)
     representation = categorical_kl(post, stop(prior)).sum(-1)
-    loss = dynamics_scale * jnp.maximum(free_nats, dynamics)
-    loss += representation_scale * jnp.maximum(free_nats, representation)
-    return loss, stop(dynamics)
+    return dynamics, representation

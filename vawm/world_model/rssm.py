@@ -9,15 +9,23 @@ import jax
 import jax.numpy as jnp
 
 from vawm import distributions, nets
-from vawm.config import WorldModelConfig
-from vawm.types import Array, EnvSpec, Inference, Key, Latent, PyTree, Trajectory
+from vawm.config import RSSMConfig
+from vawm.types import (
+    Array,
+    Batch,
+    EnvSpec,
+    Explanation,
+    Inference,
+    Key,
+    Latent,
+    PyTree,
+    Targets,
+)
 from vawm.world_model.heads import flat_stoch, make_heads
-from vawm.world_model.protocol import WorldModel
+from vawm.world_model.protocol import Imagination, WorldModel
 
 
-def network(
-    config: WorldModelConfig, *, actions: int, tokens: int, dtype: jnp.dtype
-) -> nets.RSSM:
+def network(config: RSSMConfig, *, actions: int, tokens: int, dtype: jnp.dtype) -> nets.RSSM:
     """The layers, for actions and tokens of these widths."""
     return nets.RSSM(
         deter=config.deter,
@@ -32,7 +40,7 @@ def network(
     )
 
 
-def blank(config: WorldModelConfig, batch_size: int, *, dtype: jnp.dtype) -> Latent:
+def blank(config: RSSMConfig, batch_size: int, *, dtype: jnp.dtype) -> Latent:
     """The latents before the first observation: all zero."""
     return Latent(
         jnp.zeros((batch_size, config.deter), dtype),
@@ -41,7 +49,7 @@ def blank(config: WorldModelConfig, batch_size: int, *, dtype: jnp.dtype) -> Lat
 
 
 def rssm(
-    config: WorldModelConfig,
+    config: RSSMConfig,
     spec: EnvSpec,
     *,
     dtype: jnp.dtype = jnp.float32,
@@ -51,9 +59,11 @@ def rssm(
 
         h_t = f(h_{t-1}, z_{t-1}, a_{t-1}),  z_t ~ q(z | h_t, o_t),  z~_t ~ p(z | h_t)
 
-    The carry of `observe` is the `Latent` s_{t-1}. What needs no recurrence (the
-    encoder, what the action and the observation add to their layers, the prior) is
-    computed for all time steps at once; the scan holds only the rest.
+    It remembers the `Latent` s_{t-1}, which replay keeps beside every step. What needs no
+    recurrence (the encoder, what the action and the observation add to their layers, the
+    prior) is computed for all time steps at once; the scan holds only the rest. Nothing is
+    carried from update to update (the state has no arrays), and nothing differs between
+    training and acting.
 
     Args:
       config: widths and layers.
@@ -71,23 +81,23 @@ def rssm(
     def sample(logits: Array, uniform: Array) -> Array:
         return distributions.sample_one_hot(logits, uniform, unimix=config.unimix).astype(dtype)
 
-    def init(key: Key) -> PyTree:
+    def init(key: Key) -> tuple[PyTree, PyTree]:
         key_rssm, key_heads = jax.random.split(key)
         widths = config.deter, config.stoch * config.classes, spec.action_size, heads.token_size
         params = net.init(key_rssm, *(jnp.zeros((1, width), dtype) for width in widths))
-        return {"rssm": params["params"], **heads.init(key_heads)}
+        head_params, state = heads.init(key_heads)
+        return {"rssm": params["params"], **head_params}, state
 
     def observe(
         params: PyTree,
+        state: PyTree,
         key: Key,
         carry: Latent,
         obs: PyTree,
         prev_action: Array,
         is_first: Array,
-        *,
-        train: bool,
-    ) -> tuple[Latent, Inference]:
-        del train  # nothing in this model differs between training and acting
+    ) -> Inference:
+        """Filters `[B, T, ...]` from s_0 on; `prev_action[:, t]` is a_{t-1}."""
         key_post, key_prior = jax.random.split(key)
         batch, length = is_first.shape
         obs, prev_action, is_first = jax.tree.map(
@@ -95,7 +105,7 @@ def rssm(
         )
         keep = 1.0 - is_first.astype(dtype)[..., None]
         drive = apply(params, lambda m, a: m.gru.drive(a), prev_action.astype(dtype) * keep)
-        tokens = apply(params, nets.RSSM.read_tokens, heads.encode(params, obs))
+        tokens = apply(params, nets.RSSM.read_tokens, heads.encode(params, state, obs))
         uniform = jax.random.uniform(key_post, (length, batch, config.stoch))
 
         def step(latent: Latent, inputs):
@@ -106,29 +116,71 @@ def rssm(
             latent = Latent(deter, sample(logits, uniform))
             return latent, (latent, logits)
 
-        carry, (latent, post_logits) = jax.lax.scan(step, carry, (keep, drive, tokens, uniform))
+        inputs = keep, drive, tokens, uniform
+        _, (latent, post_logits) = jax.lax.scan(step, carry, inputs)
         prior_logits = apply(params, nets.RSSM.prior, latent.deter)
         if noise == "independent":
             uniform = jax.random.uniform(key_prior, uniform.shape)
         prior_latent = Latent(latent.deter, sample(prior_logits, uniform))
-        inference = Inference(
-            latent, prior_latent, post_logits, prior_logits, jnp.ones_like(is_first)
-        )
-        return carry, jax.tree.map(lambda x: x.swapaxes(0, 1), inference)
+        inference = Inference(latent, prior_latent, post_logits, prior_logits)
+        return jax.tree.map(lambda x: x.swapaxes(0, 1), inference)
 
-    def starts(
-        params: PyTree, key: Key, trajectory: Trajectory, inference: Inference
-    ) -> tuple[tuple[Array, Latent], Latent]:
-        """Every posterior state of the batch, terminal ones included: N = B * T."""
-        del key, trajectory
-        flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), inference.latent)
-        latent = jax.lax.stop_gradient(flat)
+    def observe_batch(params: PyTree, state: PyTree, key: Key, batch: Batch) -> Inference:
+        steps = batch.trajectory
+        obs, is_first = jax.tree.map(lambda x: x[:, 1:], (steps.obs, steps.is_first))
+        prev_action = steps.action[:, :-1]
+        return observe(params, state, key, batch.context, obs, prev_action, is_first)
+
+    def filter_step(
+        params: PyTree,
+        state: PyTree,
+        key: Key,
+        carry: Latent,
+        obs: PyTree,
+        prev_action: Array,
+        is_first: Array,
+    ) -> tuple[Latent, Latent]:
+        one_step = jax.tree.map(lambda x: x[:, None], (obs, prev_action, is_first))
+        inference = observe(params, state, key, carry, *one_step)
+        latent = jax.tree.map(lambda x: x[:, 0], inference.latent)
+        return latent, latent
+
+    def explain(
+        params: PyTree, state: PyTree, key: Key, batch: Batch
+    ) -> tuple[Explanation, PyTree]:
+        """Everything at steps 1..T."""
+        inference = observe_batch(params, state, key, batch)
+        steps = jax.tree.map(lambda x: x[:, 1:], batch.trajectory)
+        predictions = heads.predict(params, state, inference.latent)
+        targets = Targets(steps.obs, steps.reward, steps.is_terminal)
+        return Explanation(inference, predictions, targets), state
+
+    def begin(params: PyTree, latent: Latent) -> Imagination:
+        latent = jax.lax.stop_gradient(latent)
         blocks = apply(params, lambda m, h: m.gru.to_blocks(h), latent.deter)
         return (blocks, latent), latent
 
+    def starts(params: PyTree, state: PyTree, inference: Inference) -> Imagination:
+        """Every posterior state of the batch, terminal ones included."""
+        del state
+        flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), inference.latent)
+        return begin(params, flat)
+
+    def follow(
+        params: PyTree, state: PyTree, key: Key, batch: Batch, *, horizon: int
+    ) -> tuple[Latent, Imagination]:
+        del horizon
+        key_observe, key_imagine = jax.random.split(key)
+        latent = observe_batch(params, state, key_observe, batch).latent
+        carry, _ = begin(params, jax.tree.map(lambda x: x[:, -1], latent))
+        return latent, imagine(
+            params, state, key_imagine, carry, batch.trajectory.action[:, -1]
+        )
+
     def imagine(
-        params: PyTree, key: Key, carry: tuple[Array, Latent], action: Array
-    ) -> tuple[tuple[Array, Latent], Latent]:
+        params: PyTree, state: PyTree, key: Key, carry: tuple[Array, Latent], action: Array
+    ) -> Imagination:
+        del state
         blocks, latent = carry
         drive = apply(params, lambda m, a: m.gru.drive(a), action.astype(dtype))
         blocks, deter, logits = apply(
@@ -138,5 +190,14 @@ def rssm(
         latent = Latent(deter, sample(logits, uniform))
         return (blocks, latent), latent
 
-    initial = functools.partial(blank, config, dtype=dtype)
-    return WorldModel(init, initial, observe, starts, imagine, heads.predict)
+    return WorldModel(
+        init=init,
+        initial=functools.partial(blank, config, dtype=dtype),
+        memory=lambda latent: latent,
+        filter=filter_step,
+        explain=explain,
+        starts=starts,
+        follow=follow,
+        imagine=imagine,
+        predict=heads.predict,
+    )

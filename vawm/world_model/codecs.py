@@ -1,0 +1,173 @@
+"""Encoders and decoders of observations: one codec for all vectors, one for all images.
+
+`make_codecs` joins the codecs of a world model, so that they read and tell any tree of vectors
+and images. Tokens are those of the vectors, then those of the images.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from vawm.errors import InvalidInput
+from vawm.types import IMAGE_SIZES, Array, EnvSpec, Key, PyTree, is_image
+
+
+class Codec(NamedTuple):
+    """Encoder and decoder of one kind of observation, as pure functions.
+
+    The state is what a normalisation carries from update to update; `()` for none.
+
+    Attributes:
+      init_encoder, init_decoder: `(key) -> (params, state)`.
+      encode: `(params, state, obs, *, train) -> (tokens, state)`, `[..., token_size]`; `obs`
+        are the arrays of this kind, in the order of the tree that an observation is.
+      decode: `(params, state, latent, *, train) -> (predictions, state)` of these arrays.
+      token_size: width of the tokens.
+    """
+
+    init_encoder: Callable[[Key], tuple[PyTree, PyTree]]
+    init_decoder: Callable[[Key], tuple[PyTree, PyTree]]
+    encode: Callable[..., tuple[Array, PyTree]]
+    decode: Callable[..., tuple[list[Array], PyTree]]
+    token_size: int
+
+
+class Codecs(NamedTuple):
+    """The codecs of an observation, joined; params and states have an entry for each kind.
+
+    Attributes:
+      init_encoder, init_decoder: `(key) -> (params, state)`.
+      encode: `(params, state, obs, *, train) -> (tokens, state)`; `obs` is the tree.
+      decode: `(params, state, latent, *, train) -> (obs, state)`.
+      token_size: width of the tokens of all kinds.
+    """
+
+    init_encoder: Callable[[Key], tuple[PyTree, PyTree]]
+    init_decoder: Callable[[Key], tuple[PyTree, PyTree]]
+    encode: Callable[..., tuple[Array, PyTree]]
+    decode: Callable[..., tuple[PyTree, PyTree]]
+    token_size: int
+
+
+def make_codecs(
+    spec: EnvSpec,
+    *,
+    vector: Callable[[list[int]], Codec],
+    image: Callable[[int, list[int]], Codec],
+) -> Codecs:
+    """Codecs for what `spec` says is observed.
+
+    Args:
+      spec: of the environment.
+      vector: makes the codec of vectors of these widths.
+      image: makes the codec of images of this size and these numbers of channels.
+
+    Raises:
+      InvalidInput: an observation that is neither a vector nor a square image whose
+        halvings fit.
+    """
+    check_obs(spec.obs)
+    leaves, tree = jax.tree.flatten(spec.obs)
+    vectors = [leaf for leaf in leaves if not is_image(leaf)]
+    images = [leaf for leaf in leaves if is_image(leaf)]
+    codecs = {}
+    if vectors:
+        codecs["vector"] = vector([leaf.shape[0] for leaf in vectors])
+    if images:
+        codecs["image"] = image(images[0].shape[0], [leaf.shape[2] for leaf in images])
+
+    def init(of_codec: Callable[[Codec], Callable[[Key], tuple[PyTree, PyTree]]]):
+        def init_all(key: Key) -> tuple[PyTree, PyTree]:
+            keys = one_each(key, codecs)
+            made = {kind: of_codec(codec)(keys[kind]) for kind, codec in codecs.items()}
+            return {k: v[0] for k, v in made.items()}, {k: v[1] for k, v in made.items()}
+
+        return init_all
+
+    def encode(params: PyTree, state: PyTree, obs: PyTree, *, train: bool):
+        arrays = jax.tree.leaves(obs)
+        kinds = {
+            "vector": [x for x in arrays if not is_image(x)],
+            "image": [x for x in arrays if is_image(x)],
+        }
+        tokens, states = {}, {}
+        for kind, codec in codecs.items():
+            tokens[kind], states[kind] = codec.encode(
+                params[kind], state[kind], kinds[kind], train=train
+            )
+        parts = list(tokens.values())
+        return parts[0] if len(parts) == 1 else jnp.concatenate(parts, -1), states
+
+    def decode(params: PyTree, state: PyTree, latent: PyTree, *, train: bool):
+        decoded, states = {}, {}
+        for kind, codec in codecs.items():
+            arrays, states[kind] = codec.decode(params[kind], state[kind], latent, train=train)
+            decoded[kind] = iter(arrays)
+        kinds = ["image" if is_image(leaf) else "vector" for leaf in leaves]
+        obs = [next(decoded[kind]).astype(jnp.float32) for kind in kinds]
+        return jax.tree.unflatten(tree, obs), states
+
+    return Codecs(
+        init_encoder=init(lambda codec: codec.init_encoder),
+        init_decoder=init(lambda codec: codec.init_decoder),
+        encode=encode,
+        decode=decode,
+        token_size=sum(codec.token_size for codec in codecs.values()),
+    )
+
+
+def join_pixels(images: list[Array]) -> Array:
+    """Images joined on their channels: `[N, size, size, C]`, leading dims flat."""
+    pixels = images[0] if len(images) == 1 else jnp.concatenate(images, -1)
+    return pixels.reshape(-1, *pixels.shape[-3:])
+
+
+def split_pixels(pixels: Array, channels: list[int]) -> list[Array]:
+    """The inverse of concatenating on the channels."""
+    ends = [sum(channels[: i + 1]) for i in range(len(channels) - 1)]
+    return jnp.split(pixels, ends, -1)
+
+
+def one_each(key: Key, names: Collection[str]) -> dict[str, Key]:
+    """A key for each name; `key` itself where there is one."""
+    keys = [key] if len(names) == 1 else list(jax.random.split(key, len(names)))
+    return dict(zip(names, keys, strict=True))
+
+
+def check_obs(obs: PyTree) -> None:
+    """Refuses observations that the networks cannot read.
+
+    Raises:
+      InvalidInput: names the first of them.
+    """
+    sizes = set()
+    for path, leaf in jax.tree_util.tree_leaves_with_path(obs):
+        name = "obs" + jax.tree_util.keystr(path)
+        shape = tuple(leaf.shape)
+        if not is_image(leaf):
+            if leaf.dtype != jnp.float32 or len(shape) != 1 or not shape[0]:
+                remedy = "vectors are float32 of one dimension, images are uint8"
+                raise InvalidInput(name, f"{leaf.dtype}{list(shape)}", remedy)
+            continue
+        if len(shape) != 3 or shape[0] != shape[1]:
+            raise InvalidInput(name, shape, "images are [size, size, channels]")
+        check_image_size(name, shape[0])
+        sizes.add(shape[0])
+    if len(sizes) > 1:
+        raise InvalidInput("obs", sorted(sizes), "all images of an observation have one size")
+
+
+def check_image_size(name: str, size: int) -> None:
+    """Refuses a side of an image that cannot be halved as often as the CNN does.
+
+    Raises:
+      InvalidInput: with the sizes that can.
+    """
+    if size not in IMAGE_SIZES:
+        low, high, step = IMAGE_SIZES[0], IMAGE_SIZES[-1], IMAGE_SIZES.step
+        remedy = f"use a multiple of {step} from {low} to {high}, such as 64, 96 or 128"
+        raise InvalidInput(name, size, remedy)

@@ -1,0 +1,276 @@
+"""The transformer world model of STORM as a `WorldModel`."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from vawm import distributions, nets
+from vawm.config import StormConfig
+from vawm.nets import Cache
+from vawm.types import (
+    Array,
+    Batch,
+    EnvSpec,
+    Explanation,
+    Inference,
+    Key,
+    Latent,
+    Predictions,
+    PyTree,
+    Targets,
+)
+from vawm.world_model.heads import flat_stoch
+from vawm.world_model.protocol import Imagination, WorldModel
+from vawm.world_model.storm_heads import make_storm_heads
+
+
+class Window(NamedTuple):
+    """What acting remembers: the last steps that are over, and the one that is not.
+
+    Steps begin at index 0, the oldest first; those beyond `length` mean nothing.
+    """
+
+    obs: PyTree  # [N, C, ...]
+    action: Array  # [N, C, A], what left from them
+    length: Array  # [N] int32, steps held
+    latest: PyTree  # [N, ...] the observation whose action is not known yet
+    waits: Array  # [N] bool, whether there is one
+
+
+def storm(
+    config: StormConfig,
+    spec: EnvSpec,
+    *,
+    dtype: jnp.dtype = jnp.float32,
+    noise: Literal["independent", "shared"] = "independent",
+) -> WorldModel:
+    """STORM's world model: a transformer over what was seen and done.
+
+        z_t ~ q(z | o_t),  e_t = mix(z_t, a_t),  h_{t+1} = f(e_1 .. e_t),  z~_t ~ p(z | h_t)
+
+    By our index h_{t+1} belongs to what arrives at t + 1: the reward, the end of the episode
+    and the prediction of z_{t+1} are read from it. The official code calls it h_t, and its
+    agent's state [z_t, h_{t-1}] is our s_t = (h_t, z_t). Reward and continuation read h alone,
+    the decoder z alone, the posterior o_t alone.
+
+    Training sees T + 1 steps: the first T observations are inferred and reconstructed, the T
+    last rewards are predicted, and the T - 1 states between are both inferred and predicted.
+    Attention, predictions and divergences cross the ends of episodes, as in the official code,
+    unless `clear_context`: then nothing before a first step is attended to, and h is 0 there.
+
+    Acting reads a window of the last `act_context` steps anew at every step. The policy's state
+    has z~_t, the prediction made before o_t is seen, or with `act_latent="posterior"` z_t;
+    before anything was seen h is 0. The official code takes a random action instead then.
+
+    Args:
+      config: widths, layers, and choices of the official code.
+      spec: shapes of observation and action.
+      dtype: of products; parameters, logits and norms stay float32.
+      noise: whether z~ is sampled with its own noise or with the noise of z.
+    """
+    heads = make_storm_heads(config, spec, dtype)
+    flat = config.stoch * config.classes
+    net = nets.Storm(
+        width=config.deter,
+        heads=config.heads,
+        feedforward=config.feedforward,
+        blocks=config.blocks,
+        positions=config.positions,
+        dropout=config.dropout,
+        stoch=config.stoch,
+        classes=config.classes,
+        action=spec.action_size,
+        tokens=heads.token_size,
+        dtype=dtype,
+    )
+
+    def apply(params: PyTree, method, *args, rngs=None):
+        return net.apply({"params": params["storm"]}, *args, method=method, rngs=rngs)
+
+    def sample(logits: Array, uniform: Array) -> Array:
+        return distributions.sample_one_hot(logits, uniform, unimix=config.unimix).astype(dtype)
+
+    def init(key: Key) -> tuple[PyTree, PyTree]:
+        key_net, key_heads = jax.random.split(key)
+        tokens, action = (
+            jnp.zeros((1, 1, heads.token_size)),
+            jnp.zeros((1, 1, spec.action_size)),
+        )
+        params = net.init(key_net, tokens, action)
+        head_params, state = heads.init(key_heads)
+        return {"storm": params["params"], **head_params}, state
+
+    def initial(batch_size: int) -> Window:
+        def blank(x) -> Array:
+            return jnp.zeros((batch_size, *x.shape), x.dtype)
+
+        def blanks(x) -> Array:
+            return jnp.zeros((batch_size, config.act_context, *x.shape), x.dtype)
+
+        return Window(
+            obs=jax.tree.map(blanks, spec.obs),
+            action=jnp.zeros((batch_size, config.act_context, spec.action_size)),
+            length=jnp.zeros(batch_size, jnp.int32),
+            latest=jax.tree.map(blank, spec.obs),
+            waits=jnp.zeros(batch_size, bool),
+        )
+
+    def visibility(is_first: Array) -> Array:
+        """`[B or 1, L, L]`: which step sees which."""
+        past = nets.causal(is_first.shape[1])
+        if not config.clear_context:
+            return past
+        episode = jnp.cumsum(is_first.astype(jnp.int32), axis=1)
+        return past & (episode[:, :, None] == episode[:, None, :])
+
+    def clear(deter: Array, is_first: Array) -> Array:
+        """h, or 0 where an episode begins and the one before is to be forgotten."""
+        if not config.clear_context:
+            return deter
+        return deter * (1.0 - is_first.astype(deter.dtype)[..., None])
+
+    def infer(
+        params: PyTree, state: PyTree, key: Key, obs: PyTree, *, train: bool
+    ) -> tuple[Array, Array, Array, PyTree]:
+        """Of every observation alone: logits, z, the numbers that drew it, and the state."""
+        tokens, state = heads.encode(params, state, obs, train=train)
+        logits = apply(params, nets.Storm.posterior, tokens)
+        uniform = jax.random.uniform(key, logits.shape[:-1])
+        return logits, sample(logits, uniform), uniform, state
+
+    def explain(
+        params: PyTree, state: PyTree, key: Key, batch: Batch
+    ) -> tuple[Explanation, PyTree]:
+        key_post, key_prior, key_dropout = jax.random.split(key, 3)
+        steps = batch.trajectory
+        taken = jax.tree.map(lambda x: x[:, :-1], steps)
+        arrived = jax.tree.map(lambda x: x[:, 1:], steps)
+        post_logits, stoch, uniform, state = infer(
+            params, state, key_post, taken.obs, train=True
+        )
+        deter = apply(
+            params,
+            nets.Storm.read_in_training,
+            stoch.reshape(*stoch.shape[:2], flat),
+            taken.action,
+            visibility(taken.is_first),
+            rngs={"dropout": key_dropout},
+        )
+        deter = clear(deter, arrived.is_first)
+        prior_logits = apply(params, nets.Storm.prior, deter)
+        if noise == "independent":
+            uniform = jax.random.uniform(key_prior, uniform.shape)
+            uniform = uniform[:, :-1]
+        else:
+            uniform = uniform[:, 1:]
+        inference = Inference(
+            latent=Latent(deter[:, :-1], stoch[:, 1:]),
+            prior_latent=Latent(deter[:, :-1], sample(prior_logits[:, :-1], uniform)),
+            post_logits=post_logits[:, 1:],
+            prior_logits=prior_logits[:, :-1],
+        )
+        flat_z = stoch.reshape(*stoch.shape[:2], flat)
+        obs, state = heads.decode(params, state, flat_z, train=True)
+        predictions = Predictions(obs, *heads.outcome(params, deter))
+        targets = Targets(taken.obs, arrived.reward, arrived.is_terminal)
+        return Explanation(inference, predictions, targets), state
+
+    def read(params: PyTree, stoch: Array, action: Array, visible: Array):
+        """h after every step, and keys and values, without dropout."""
+        z = stoch.reshape(*stoch.shape[:2], flat)
+        return apply(params, nets.Storm.read, z, action, visible)
+
+    def expect(params: PyTree, key: Key, deter: Array) -> Latent:
+        """`[N, D]` -> what the prior expects there."""
+        logits = apply(params, nets.Storm.prior, deter)
+        return Latent(deter, sample(logits, jax.random.uniform(key, logits.shape[:-1])))
+
+    def follow(
+        params: PyTree, state: PyTree, key: Key, batch: Batch, *, horizon: int
+    ) -> tuple[Latent, Imagination]:
+        key_post, key_prior = jax.random.split(key)
+        steps = batch.trajectory
+        _, stoch, _, _ = infer(params, state, key_post, steps.obs, train=False)
+        visible = visibility(steps.is_first)
+        deter, keys, values = read(params, stoch, steps.action, visible)
+        inferred = Latent(clear(deter[:, :-1], steps.is_first[:, 1:]), stoch[:, 1:])
+        latent = expect(params, key_prior, deter[:, -1])
+        last = jnp.broadcast_to(visible[:, -1], steps.is_first.shape)
+        cache = nets.fill(keys, values, last, slots=steps.is_first.shape[1] + horizon)
+        return inferred, ((cache, latent), latent)
+
+    def imagine(
+        params: PyTree, state: PyTree, key: Key, carry: tuple[Cache, Latent], action: Array
+    ) -> Imagination:
+        del state
+        cache, latent = carry
+        deter, cache = apply(params, nets.Storm.step, flat_stoch(latent), action, cache)
+        latent = expect(params, key, deter)
+        return (cache, latent), latent
+
+    def filter_step(
+        params: PyTree,
+        state: PyTree,
+        key: Key,
+        carry: Window,
+        obs: PyTree,
+        prev_action: Array,
+        is_first: Array,
+    ) -> tuple[Window, Latent]:
+        key_post, key_z = jax.random.split(key)
+        window = remember(carry, prev_action)
+        if config.clear_context:
+            window = window._replace(length=jnp.where(is_first, 0, window.length))
+        _, stoch, _, _ = infer(params, state, key_post, window.obs, train=False)
+        deter, _, _ = read(params, stoch, window.action, nets.causal(config.act_context))
+        newest = jnp.maximum(window.length - 1, 0)[:, None, None]
+        deter = jnp.take_along_axis(deter, newest, axis=1)[:, 0]
+        deter = deter * (window.length > 0).astype(deter.dtype)[:, None]
+        if config.act_latent == "prior":
+            latent = expect(params, key_z, deter)
+        else:
+            _, stoch, _, _ = infer(params, state, key_z, obs, train=False)
+            latent = Latent(deter, stoch)
+        return window._replace(latest=obs, waits=jnp.ones_like(window.waits)), latent
+
+    def predict(params: PyTree, state: PyTree, latent: Latent) -> Predictions:
+        obs, _ = heads.decode(params, state, flat_stoch(latent), train=False)
+        return Predictions(obs, *heads.outcome(params, latent.deter))
+
+    return WorldModel(
+        init=init,
+        initial=initial,
+        memory=lambda carry: (),
+        filter=filter_step,
+        explain=explain,
+        starts=None,
+        follow=follow,
+        imagine=imagine,
+        predict=predict,
+    )
+
+
+def remember(window: Window, action: Array) -> Window:
+    """`window` with the step that was waiting for `action`, if there was one."""
+    context = window.action.shape[1]
+    full = window.length == context
+
+    def append(past: Array, new: Array) -> Array:
+        def per_row(flag: Array) -> Array:
+            return flag.reshape(-1, *(1,) * (past.ndim - 1))
+
+        moved = jnp.where(per_row(full), jnp.roll(past, -1, axis=1), past)
+        place = jnp.where(full, context - 1, window.length)
+        here = jnp.arange(context)[None] == place[:, None]
+        here = (here & window.waits[:, None]).reshape(*here.shape, *(1,) * (past.ndim - 2))
+        appended = jnp.where(here, new[:, None], moved)
+        return jnp.where(per_row(window.waits), appended, past)
+
+    return window._replace(
+        obs=jax.tree.map(append, window.obs, window.latest),
+        action=append(window.action, action),
+        length=jnp.where(window.waits & ~full, window.length + 1, window.length),
+    )
