@@ -1,7 +1,8 @@
-"""Value-aligned DreamerV3 on the 26 games of Atari 100k.
+"""Value-aligned DreamerV3 or STORM on the 26 games of Atari 100k.
 
     python experiments/atari100k.py --game breakout                  # small, on a CPU
     python experiments/atari100k.py --game krull --preset paper      # 100k steps, on a GPU
+    python experiments/atari100k.py --agent storm --game kung_fu_master
     python experiments/atari100k.py --game freeway --actor.collect-temperature 0.01
 
 `--game` is short for `--task`. Every field of `vawm.config.Config` is a flag, those of

@@ -2,11 +2,12 @@
 
     python experiments/benchmark.py --size 1m --json
     python experiments/benchmark.py --size 1m --obs pixels --json
+    python experiments/benchmark.py --agent storm --obs pixels --json
 
 Prints medians over repeated runs after a warm-up; absolute times depend on the machine,
 ratios within one run are to be trusted. "off" drops value alignment from the compiled
-program altogether, its metrics included, so it is plain DreamerV3. From pixels, collection is
-timed with environments that dm_control renders in 1 to 4 processes.
+program altogether, its metrics included, so it is plain DreamerV3, or plain STORM. From pixels,
+collection is timed with environments that dm_control renders in 1 to 4 processes.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vawm import envs, flags, huge_pages, memory, suites, train, validate
+from vawm import envs, flags, huge_pages, learn, memory, suites, train, validate
 from vawm.agent import make_agent, parameter_count
 from vawm.collector import make_collect
 from vawm.command_line import guard
@@ -41,19 +42,21 @@ from vawm.config import (
 )
 from vawm.envs.protocol import check_positive
 from vawm.errors import InvalidInput
+from vawm.learn import Draw
 from vawm.learner import init_learner, make_update
-from vawm.objective import Batch
-from vawm.presets import PAPER
-from vawm.types import EnvSpec, Latent, Trajectory, image, vector
-from vawm.world_model.heads import check_image_size
+from vawm.presets import PAPER, STORM
+from vawm.types import Batch, EnvSpec, Trajectory, image, vector
+from vawm.world_model.codecs import check_image_size
 
 
 @dataclass(frozen=True)
 class Benchmark:
     """Time the update, its compilation, and stepping environments with the policy."""
 
-    size: str = "1m"
-    """model size"""
+    agent: Literal["dreamerv3", "storm"] = "dreamerv3"
+    """storm: Table 14, imagination from 1024 contexts of their own"""
+    size: str | None = None
+    """model size; 1m for dreamerv3, 16m for storm if not given"""
     batch_size: int = 16
     batch_length: int = 64
     obs: Literal["vector", "pixels"] = "vector"
@@ -79,7 +82,7 @@ class Benchmark:
 
 def check(options: Benchmark) -> None:
     """Refuses what cannot be measured, before anything is compiled."""
-    validate.check_choice("size", options.size, SIZES)
+    validate.check_choice("size", size_of(options), SIZES[options.agent])
     envs.check_task(options.task)
     check_image_size("image_size", options.image_size)
     for field in dataclasses.fields(options):
@@ -90,24 +93,29 @@ def check(options: Benchmark) -> None:
                 raise InvalidInput(field.name, value, f"use a number below {validate.INT32}")
 
 
+def size_of(options: Benchmark) -> str:
+    return options.size or {"dreamerv3": "1m", "storm": "16m"}[options.agent]
+
+
 def make_config(options: Benchmark) -> Config:
+    paper = {"dreamerv3": PAPER, "storm": STORM}[options.agent]
     return dataclasses.replace(
-        with_size(PAPER, options.size),
+        with_size(paper, size_of(options)),
         compute_dtype=options.compute_dtype,
         num_envs=options.num_envs,
         action_repeat=1,
         env_steps=options.num_envs * options.env_calls,
         collect_steps=options.env_calls,
         replay=dataclasses.replace(
-            PAPER.replay, batch_size=options.batch_size, batch_length=options.batch_length
+            paper.replay, batch_size=options.batch_size, batch_length=options.batch_length
         ),
         value_alignment=ValueAlignmentConfig(warmup_steps=0),
     )
 
 
-def synthetic_batch(options: Benchmark, config: Config, latent: Latent) -> Batch:
-    shape = options.batch_size, options.batch_length + 1
-    key_obs, key_action, key_reward = jax.random.split(jax.random.key(0), 3)
+def synthetic_batch(options: Benchmark, shape: tuple[int, int], context, seed: int) -> Batch:
+    """Experience of `shape` sequences and steps."""
+    key_obs, key_action, key_reward = jax.random.split(jax.random.key(seed), 3)
     flags = jnp.zeros(shape, bool)
     spec = make_spec(options)
     if options.obs == "pixels":
@@ -125,7 +133,7 @@ def synthetic_batch(options: Benchmark, config: Config, latent: Latent) -> Batch
         is_terminal=flags,
         action=action,
     )
-    return Batch(trajectory, latent)
+    return Batch(trajectory, context)
 
 
 def make_spec(options: Benchmark) -> EnvSpec:
@@ -139,11 +147,12 @@ def make_spec(options: Benchmark) -> EnvSpec:
 class TimedUpdate:
     """One compiled variant of the update and the learner that it advances."""
 
-    def __init__(self, agent, config: Config, batch: Batch, aligned: bool):
+    def __init__(self, agent, config: Config, batch: Draw, aligned: bool):
         update = make_update(agent, config)
 
         def step(learner, batch, key):
-            learner, latent, metrics = update(learner, batch, key, jnp.ones((), jnp.int32))
+            step = jnp.ones((), jnp.int32)
+            learner, latent, metrics = update(learner, batch.batch, batch.contexts, key, step)
             kept = {k: v for k, v in metrics.items() if aligned or "alignment" not in k}
             return learner, latent, kept
 
@@ -170,12 +179,10 @@ def env_steps_per_s(options: Benchmark, config: Config) -> float:
     agent = make_agent(config, env.spec)
     state = train.init(env, agent, config, jax.random.key(0))
     collect = jax.jit(make_collect(env, agent, config))
-    seconds = []
+    acting, seconds = (state.learner.params, state.learner.model_state), []
     for _ in range(4):
         begin = time.perf_counter()
-        jax.block_until_ready(
-            collect(state.learner.params, state.collector, state.replay, state.key)
-        )
+        jax.block_until_ready(collect(*acting, state.collector, state.replay, state.key))
         seconds.append(time.perf_counter() - begin)
     return options.num_envs * options.env_calls / statistics.median(seconds[1:])
 
@@ -190,12 +197,12 @@ def frames_per_s(options: Benchmark, config: Config) -> dict[str, float]:
         with contextlib.closing(suites.on_host(config, many)) as environments:
             timestep = environments.reset(0)
             agent = make_agent(config, environments.spec)
-            params, carry = agent.init(jax.random.key(0)), agent.initial(options.num_envs)
+            acting, carry = agent.init(jax.random.key(0)), agent.initial(options.num_envs)
             act = act or jax.jit(agent.act)
             seconds = []
             for _ in range(options.env_calls + 2):
                 begin = time.perf_counter()
-                carry, action = act(params, jax.random.key(0), carry, timestep)
+                carry, action = act(*acting, jax.random.key(0), carry, timestep)
                 environments.send(np.asarray(action))
                 timestep = environments.receive()
                 seconds.append(time.perf_counter() - begin)
@@ -232,7 +239,13 @@ def run(options: Benchmark) -> dict:
     config = make_config(options)
     agent = make_agent(config, make_spec(options))
     check_memory(agent, config)
-    batch = synthetic_batch(options, config, agent.world_model.initial(options.batch_size))
+    shapes = learn.shapes(config)
+    remembered = agent.world_model.initial(options.batch_size)
+    context = agent.world_model.memory(remembered)
+    batch = Draw(
+        synthetic_batch(options, shapes.batch, context, seed=0),
+        shapes.contexts and synthetic_batch(options, shapes.contexts, (), seed=1),
+    )
     plain = dataclasses.replace(
         config, value_alignment=dataclasses.replace(config.value_alignment, weight="off")
     )
@@ -254,7 +267,8 @@ def run(options: Benchmark) -> dict:
     else:
         collected = {"env_steps_per_s": env_steps_per_s(options, config)}
     return {
-        "size": options.size,
+        "agent": options.agent,
+        "size": size_of(options),
         "obs": options.obs,
         "image_size": options.image_size if options.obs == "pixels" else None,
         "params": parameter_count(on.learner.params),

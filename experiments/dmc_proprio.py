@@ -1,8 +1,9 @@
-"""Value-aligned DreamerV3 on the DeepMind Control Suite, from proprioception.
+"""Value-aligned DreamerV3 or STORM on the DeepMind Control Suite, from proprioception.
 
     python experiments/dmc_proprio.py                                # minutes on a CPU
     python experiments/dmc_proprio.py --task walker_walk --preset paper        # on a GPU
     python experiments/dmc_proprio.py --value-alignment.weight off   # plain DreamerV3
+    python experiments/dmc_proprio.py --agent storm                  # the transformer
 
 Every field of `vawm.config.Config` is a flag; `--help` lists them.
 """

@@ -1,4 +1,4 @@
-"""Value-aligned DreamerV3 on any registered Gymnasium environment.
+"""Value-aligned DreamerV3 or STORM on any registered Gymnasium environment.
 
     python experiments/gymnasium_task.py --task CartPole-v1
 

@@ -2,9 +2,11 @@
 
     python experiments/learning_curves.py --jobs 2
     python experiments/learning_curves.py --experiment gymnasium_task --preset pixels
+    python experiments/learning_curves.py --agent storm --tasks cartpole_balance
 
 Runs what is missing under `--runs`, `--jobs` at a time (on Linux each on cores of its own),
-and writes `curves_<experiment>.csv` and `.png` to `--results`. Interrupted runs are resumed,
+and writes `curves_<experiment>.csv` and `.png` to `--results`, of another agent than dreamerv3
+`curves_<experiment>_<agent>`. Interrupted runs are resumed,
 finished ones left alone.
 """
 
@@ -54,6 +56,7 @@ class Options:
         "dmc_proprio"
     )
     """the program that trains"""
+    agent: Literal["dreamerv3", "storm"] = "dreamerv3"
     tasks: tuple[str, ...] = ()
     """as many as are named; the usual ones of the experiment if none"""
     seeds: tuple[int, ...] = (0, 1, 2)
@@ -77,9 +80,15 @@ class Options:
     def suite(self) -> str:
         return EXPERIMENTS[self.experiment].suite
 
+    @property
+    def name(self) -> str:
+        """Of the folder of its runs, and in the names of its results."""
+        suffix = "" if self.agent == "dreamerv3" else f"_{self.agent}"
+        return self.experiment + suffix
+
     def result(self, ending: str) -> pathlib.Path:
         """Where a file of results goes."""
-        return self.results / f"curves_{self.experiment}.{ending}"
+        return self.results / f"curves_{self.name}.{ending}"
 
 
 @dataclass(frozen=True)
@@ -90,11 +99,12 @@ class Run:
 
     def folder(self, options: Options) -> pathlib.Path:
         name = f"{self.task.replace('/', '-')}-{self.alignment}-seed{self.seed}"
-        return options.runs / options.experiment / name
+        return options.runs / options.name / name
 
     def command(self, options: Options) -> list[str]:
         folder = self.folder(options)
         arguments = {
+            "--agent": options.agent,
             "--task": self.task,
             "--preset": options.preset,
             "--seed": str(self.seed),
@@ -129,7 +139,7 @@ def check(options: Options) -> None:
       InvalidInput: names the option, its value and the remedy.
       RunError: a package is missing.
     """
-    config = validate.preset(options.suite, options.preset)
+    config = validate.preset(options.agent, options.suite, options.preset)
     if options.env_steps is not None:
         config = dataclasses.replace(config, env_steps=options.env_steps)
     for seed in options.seeds:
