@@ -448,9 +448,10 @@ class StridedEncoder(nn.Module):
     """STORM's CNN: four halvings, then all that is left as one vector.
 
     `[N, size, size, channels]` pixels from 0 to 255, as bytes or floats, of which it reads
-    pixels / 255 -> `[N, (size / 16)^2 * 8 * depth]`, in order of rows, columns, channels. `train=True` normalises by the statistics of the batch
-    and needs `mutable=["statistics"]`; `train=False` takes the running ones. Source:
-    `EncoderBN` of weipu-zhang/STORM. Raises ValueError unless sides are multiples of 16.
+    pixels / 255 -> `[N, (size / 16)^2 * 8 * depth]`, in order of rows, columns, channels.
+    `train=True` normalises by the statistics of the batch and needs `mutable=["statistics"]`;
+    `train=False` takes the running ones. Source: `EncoderBN` of weipu-zhang/STORM. Raises
+    ValueError unless sides are multiples of 16.
     """
 
     channels: int
