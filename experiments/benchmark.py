@@ -36,6 +36,7 @@ from vawm.command_line import guard
 from vawm.config import (
     SIZES,
     Config,
+    StormConfig,
     ValueAlignmentConfig,
     VisionConfig,
     with_size,
@@ -83,6 +84,10 @@ class Benchmark:
 def check(options: Benchmark) -> None:
     """Refuses what cannot be measured, before anything is compiled."""
     validate.check_choice("size", size_of(options), SIZES[options.agent])
+    positions = StormConfig().positions
+    if options.agent == "storm" and options.batch_length > positions:
+        remedy = f"use at most {positions}, the transformer's positions"
+        raise InvalidInput("batch_length", options.batch_length, remedy)
     envs.check_task(options.task)
     check_image_size("image_size", options.image_size)
     for field in dataclasses.fields(options):

@@ -29,6 +29,11 @@ benchmark, curves = load("benchmark"), load("learning_curves")
     ("module", "flags", "message"),
     [
         (benchmark, ["--size", "2m"], "size='2m': did you mean"),
+        (
+            benchmark,
+            ["--agent", "storm", "--batch-length", "65"],
+            "batch_length=65: use at most 64, the transformer's positions",
+        ),
         (benchmark, ["--task", "walker_wlak"], "task='walker_wlak': did you mean"),
         (benchmark, ["--num-envs", "0"], "num_envs=0: use a whole number of at least 1"),
         (benchmark, ["--repeats", "0"], "repeats=0: use a whole number of at least 1"),

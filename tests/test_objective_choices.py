@@ -96,8 +96,9 @@ def slow_behaviour(names, h, z, scale):
 
     def discount(state):
         logit = 2 + state[0] - 40 * state[1]
-        if "threshold" in names:
-            return DISCOUNT * (logit > 0)
+        if "threshold" in names:  # more likely than not, once gamma is divided out
+            gamma = 1.0 if "plain" in names else DISCOUNT
+            return DISCOUNT * (1 / (1 + np.exp(-logit)) / gamma >= 0.5)
         cont = 1 / (1 + np.exp(-logit))
         return DISCOUNT * cont if "plain" in names else cont
 

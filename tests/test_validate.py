@@ -270,6 +270,14 @@ CUSTOM_STORM = changed("size", "custom", STORM)
             "imagination.horizon=57: a sequence of 65 after 8 of context has no position",
         ),
         (
+            changed("imagination.horizon", 25, STORM),
+            "imagination.horizon=25: needs 33 positions, of which training sees replay.batch_",
+        ),
+        (
+            changed("world_model.act_context", 33, STORM),
+            "world_model.act_context=33: needs 33 positions",
+        ),
+        (
             changed("world_model.deter", 126, CUSTOM_STORM),
             "world_model.deter=126: use a multiple of world_model.heads=4",
         ),
@@ -286,9 +294,9 @@ def test_what_an_agent_cannot_do_is_refused(config, message):
     "config",
     [
         changed("world_model.positions", 32, STORM),
-        changed("world_model.act_context", 64, STORM),
-        changed("imagination.horizon", 56, STORM),
-        changed("imagination.context_length", 32, STORM),
+        changed("world_model.act_context", 32, STORM),
+        changed("imagination.horizon", 24, STORM),
+        changed("imagination.context_length", 16, STORM),
         changed("world_model.deter", 124, CUSTOM_STORM),
         # A recurrent model can follow a context too.
         changed("critic.replay_scale", 0.0, FROM_CONTEXTS),

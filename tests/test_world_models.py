@@ -209,6 +209,21 @@ def test_imagination_after_a_first_step_does_not_see_the_episode_before(name):
     assert same == (name in FORGETTING)
 
 
+def test_a_cleared_context_starts_anew_where_its_last_step_ends_an_episode():
+    """As a sequence of training has it: h is 0 there, and nothing before is seen again."""
+    name, seed = "storm_clear", 2
+    params, state = variables(name)
+    reached = []
+    for s in (1, 9):
+        batch = experience(name, seed=s)
+        is_last = batch.trajectory.is_last.at[:, -1].set(True)
+        ended = batch._replace(trajectory=batch.trajectory._replace(is_last=is_last))
+        _, (carry, latent) = follow(name)(params, state, seed, ended)
+        assert (latent.deter == 0).all()
+        reached.append(imagine(name)(params, state, seed, carry, jnp.ones((BATCH, 3)))[1])
+    close(*reached, atol=1e-6)
+
+
 @pytest.mark.parametrize("name", MODELS)
 def test_acting_step_by_step_sees_what_a_sequence_sees(name):
     """The latents of `filter` have the h of `follow`, as long as its memory reaches back."""

@@ -30,7 +30,7 @@ CONFIG = dataclasses.replace(
     imagination=dataclasses.replace(
         presets.STORM.imagination, horizon=3, batch_size=6, context_length=4
     ),
-    optimizer=config_lib.AdamConfig(learning_rate=1e-3, behaviour_learning_rate=1e-3),
+    optimizer=config_lib.AdamConfig(learning_rate=1e-3, behaviour_learning_rate=1e-2),
 )
 
 

@@ -118,7 +118,8 @@ class StormConfig(WorldModelConfig):
     """what the policy reads: the prediction, made before the observation is seen, as in the
     official code; or what is inferred from the observation"""
     clear_context: bool = False
-    """whether acting forgets the episode before; the official code does not"""
+    """whether attention ends where an episode begins, in training, imagination and acting; it
+    does not in the official code"""
 
 
 @dataclass(frozen=True)
@@ -229,7 +230,9 @@ class LaPropConfig(OptimizerConfig):
 
 @dataclass(frozen=True)
 class AdamConfig(OptimizerConfig):
-    """First the world model, then actor and critic in what it has become; Table 14.
+    """First the world model, then actor and critic in what it has become.
+
+    Table 14, and both epsilons of the official code.
 
     Each has an Adam of its own after clipping by the global norm of its gradient.
     """

@@ -162,7 +162,7 @@ def working_bytes(spec: EnvSpec, config: Config) -> int:
         assert isinstance(model, RSSMConfig)
         observed, cache = 8 * feature + 4 * _rssm_step(model, config), 0
     numbers = steps * observed + states * imagined
-    maps = steps * _image_maps(spec, config)
+    maps = max(steps * _image_maps(spec, config), _context_maps(spec, config))
     return 4 * (WORKING_FACTOR * numbers + cache + IMAGE_FACTOR * maps)
 
 
@@ -209,6 +209,15 @@ def _image_maps(spec: EnvSpec, config: Config) -> int:
         side = size // 2 ** (stage + strides)
         numbers += 2 * side * side * width * config.world_model.depth
     return numbers
+
+
+def _context_maps(spec: EnvSpec, config: Config) -> int:
+    """The same in the encoder's maps of the contexts; a CPU has those of a few at a time."""
+    imagination = config.imagination
+    if imagination.starts != "contexts" or jax.default_backend() == "cpu":
+        return 0
+    contexts = imagination.batch_size * imagination.context_length
+    return contexts * _image_maps(spec, config) // (2 * IMAGE_FACTOR)  # kept once, no gradient
 
 
 def available() -> dict[str, int | None]:

@@ -10,6 +10,7 @@ or one after the other.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -198,11 +199,14 @@ def make_foresight(agent: Agent, config: Config):
 
     def read_discount(logit: Array) -> Array:
         """gamma * P(continue), or gamma where an episode is expected to go on, else 0."""
-        hard = imagination.continuation == "threshold"
-        cont = (logit > 0).astype(logit.dtype) if hard else jax.nn.sigmoid(logit)
-        if undiscounted:
-            return discount_of(config) * cont
-        return discount_of(config) * cont if hard else cont
+        gamma = discount_of(config)
+        if imagination.continuation == "threshold":
+            half = (
+                0.0 if undiscounted else math.log(gamma / (2.0 - gamma))
+            )  # logit of gamma / 2
+            return gamma * (logit >= half).astype(logit.dtype)
+        cont = jax.nn.sigmoid(logit)
+        return gamma * cont if undiscounted else cont
 
     def returns_of(reward: Array, discount: Array, value: Array) -> Array:
         """`[H, N]` from what arrived with s_0..s_H and the values there."""

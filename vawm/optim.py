@@ -79,7 +79,7 @@ class Adams(NamedTuple):
 
 
 def make_adams(config: AdamConfig) -> Adams:
-    """Adam after clipping by the global norm, as `torch.nn.utils.clip_grad_norm_` has it."""
+    """Adam after clipping by the global norm."""
 
     def adam(learning_rate: float, clip: float, epsilon: float) -> optax.GradientTransformation:
         return optax.chain(

@@ -219,6 +219,12 @@ def _check_imagination(config: Config) -> None:
                 f"or more world_model.positions than {model.positions}"
             )
             raise InvalidInput(name, _get(config, name), remedy)
+        if length > config.replay.batch_length:
+            remedy = (
+                f"needs {length} positions, of which training sees "
+                f"replay.batch_length={config.replay.batch_length}: use less, or longer batches"
+            )
+            raise InvalidInput(name, _get(config, name), remedy)
 
 
 def _get(config: Config, name: str) -> Any:

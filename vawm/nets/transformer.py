@@ -28,6 +28,7 @@ HIDDEN = -1e30  # the score of what must not be attended to
 class Cache(NamedTuple):
     """Keys and values of N sequences in a fixed number of slots, of which the first are in use.
 
+    A step that finds no free slot is lost: there have to be enough.
     Slots are the first axis: a step reads only those in use, each in one piece.
     """
 
@@ -44,7 +45,8 @@ def causal(length: int) -> Array:
 
 def attend(query: Array, key: Array, value: Array, visible: Array, dropout) -> Array:
     """`[B, L, heads, d]` three times, `[B or 1, L, L]` -> `[B, L, heads * d]`."""
-    scores = jnp.einsum("bqhd,bkhd->bhqk", query, key).astype(jnp.float32)
+    f32 = jnp.float32
+    scores = jnp.einsum("bqhd,bkhd->bhqk", query, key, preferred_element_type=f32)
     scores = jnp.where(visible[:, None], scores / math.sqrt(query.shape[-1]), HIDDEN)
     weights = dropout(jax.nn.softmax(scores)).astype(value.dtype)
     mixed = jnp.einsum("bhqk,bkhd->bqhd", weights, value)
@@ -70,7 +72,8 @@ def attend_at_once(
     query: Array, keys: Array, values: Array, visible: Array, length: Array
 ) -> Array:
     """`[N, heads, d]` float32."""
-    scores = jnp.einsum("nhd,snhd->nhs", query, keys).astype(jnp.float32)
+    f32 = jnp.float32
+    scores = jnp.einsum("nhd,snhd->nhs", query, keys, preferred_element_type=f32)
     used = jnp.arange(keys.shape[0]) < length
     shown = (visible & used[:, None]).T
     scores = jnp.where(shown[:, None], scores / math.sqrt(query.shape[-1]), HIDDEN)

@@ -24,7 +24,7 @@ class WorldModel(NamedTuple):
         begins a sequence; `()` for nothing. Also of the latents of an `Inference`.
       filter: `(params, state, key, carry, obs, prev_action, is_first) -> (carry, Latent)`, one
         step of acting, `[N, ...]`: the latent that the policy reads. `prev_action` led to
-        `obs`; it is ignored where `is_first`.
+        `obs`; where `is_first` it is of no episode.
       explain: `(params, state, key, batch) -> (Explanation, state)`, in training mode.
       starts: `(params, state, inference) -> Imagination`, from every state inferred, N = B * T,
         batch-major, gradients stopped; None where a model cannot.

@@ -63,7 +63,8 @@ def storm(
 
     Acting reads a window of the last `act_context` steps anew at every step. The policy's state
     has z~_t, the prediction made before o_t is seen, or with `act_latent="posterior"` z_t;
-    before anything was seen h is 0. The official code takes a random action instead then.
+    before anything was seen h is 0. The official code takes a random action instead then, and
+    fills its window only once the random steps of the beginning are over.
 
     Args:
       config: widths, layers, and choices of the official code.
@@ -197,8 +198,11 @@ def storm(
         visible = visibility(steps.is_first)
         deter, keys, values = read(params, stoch, steps.action, visible)
         inferred = Latent(clear(deter[:, :-1], steps.is_first[:, 1:]), stoch[:, 1:])
-        latent = expect(params, key_prior, deter[:, -1])
+        ends = steps.is_last[:, -1]  # a new episode is what comes next
+        latent = expect(params, key_prior, clear(deter[:, -1], ends))
         last = jnp.broadcast_to(visible[:, -1], steps.is_first.shape)
+        if config.clear_context:
+            last = last & ~ends[:, None]
         cache = nets.fill(keys, values, last, slots=steps.is_first.shape[1] + horizon)
         return inferred, ((cache, latent), latent)
 
