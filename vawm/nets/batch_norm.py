@@ -49,8 +49,8 @@ def _forward(x: Array, scale: Array, bias: Array):
     mean = batch_mean(x)
     var = batch_mean(jnp.square(x.astype(jnp.float32) - per_channel(mean, x)))
     inverse = jax.lax.rsqrt(var + EPSILON)
-    y = affine(x, scale * inverse, bias - mean * scale * inverse)
-    return (y, mean, var), (x, scale, mean, inverse)
+    y = affine(x.astype(jnp.float32) - per_channel(mean, x), scale * inverse, bias)
+    return (y.astype(x.dtype), mean, var), (x, scale, mean, inverse)
 
 
 def _backward(saved: tuple[Array, ...], gradients: tuple[Array, Array, Array]):

@@ -158,15 +158,19 @@ def tiles_of_blocks(fine: Array) -> Matrices:
     count, height, width, channels = fine.shape
     height, width = height // 4, width // 4
     x = jnp.pad(fine, ((0, 0), (1, 3), (1, 3), (0, 0)))
-    x = x.reshape(count, height + 1, 4, width + 1, 4, channels)
+    # The two columns of a block and their channels lie side by side already.
+    x = x.reshape(count, height + 1, 4, width + 1, 2, 2 * channels)
 
-    def pixel(i: int, j: int) -> Array:  # 0..5 of all tiles
-        rows, columns = slice(i // 4, i // 4 + height), slice(j // 4, j // 4 + width)
-        return x[:, rows, i % 4, columns, j % 4]
+    def pair(row: int, block: int) -> Array:  # row 0..5 and column of blocks 0..2 of all tiles
+        rows, columns = (
+            slice(row // 4, row // 4 + height),
+            slice(block // 2, block // 2 + width),
+        )
+        return x[:, rows, row % 4, columns, block % 2]
 
-    phases = []  # [phase][k]
-    for p, q in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        blocks = [[pixel(2 * i + p, 2 * j + q) for i in range(3)] for j in range(3)]
+    phases = []  # [row of a block][k]
+    for p in (0, 1):
+        blocks = [[pair(2 * i + p, j) for i in range(3)] for j in range(3)]
         columns = [differences(*column) for column in blocks]
         rows = zip(*columns, strict=True)
         phases.append([entry for row in rows for entry in differences(*row)])
