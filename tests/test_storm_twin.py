@@ -5,6 +5,7 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 import storm_twin
 import tiny_storm
 from test_nets import float64
@@ -12,7 +13,7 @@ from test_nets import float64
 from vawm.agent import make_agent
 from vawm.config import ValueAlignmentConfig
 from vawm.learner import init_learner, make_update
-from vawm.objective import make_world_model_loss
+from vawm.objective import make_behaviour_loss, make_world_model_loss
 from vawm.types import Batch, EnvSpec, Trajectory, image
 
 SPEC = EnvSpec("test", image(48), 3, True, 1, 1, None)
@@ -212,13 +213,60 @@ def test_gradients_are_the_differences_of_the_official_loss():
             assert error <= 2e-3 * scale + 1e-5, (path, index, ours_here[index], expected)
 
 
+def contexts():
+    shape = CONFIG.imagination.batch_size, CONFIG.imagination.context_length
+    return as_batch(trajectory(shape, seed=1))
+
+
+@functools.cache
+def compiled_update():
+    return jax.jit(make_update(AGENT, CONFIG))
+
+
+def update(state):
+    """The learner after one update, and its metrics."""
+    arguments = as_batch(DATA), contexts(), key_update(), jnp.asarray(1)
+    after, _, metrics = compiled_update()(state, *arguments)
+    return after, metrics
+
+
+def test_actor_and_critic_learn_in_what_the_world_model_has_become():
+    """With its new parameters and its new statistics, and not with either of the old ones."""
+    world_model = jax.tree.map(lambda x: x, learner().params.world_model)
+    kernel = world_model["storm"]["posterior_out"]["kernel"]
+    world_model["storm"]["posterior_out"]["kernel"] = 300 * kernel  # so that z follows o
+    state = learner()._replace(
+        params=learner().params._replace(world_model=world_model),
+        # Variances so small that a tenth of the batch's changes them a lot.
+        model_state=jax.tree.map(lambda x: 1e-6 * x, learner().model_state),
+    )
+    after, metrics = update(state)
+    behaviour_loss = jax.jit(make_behaviour_loss(AGENT, CONFIG))
+
+    def critic_loss(world_model, model_state):
+        _, (_, measured) = behaviour_loss(
+            state.params._replace(world_model=world_model),
+            model_state,
+            state.slow_critic,
+            state.return_scale,
+            as_batch(DATA),
+            (),
+            contexts(),
+            jax.random.split(key_update())[1],
+        )
+        return float(measured["loss/critic"])
+
+    old, new = (s.params.world_model for s in (state, after))
+    expected = float(metrics["loss/critic"])
+    assert critic_loss(new, after.model_state) == pytest.approx(expected, rel=1e-5)
+    for other in ((old, after.model_state), (new, state.model_state)):
+        assert critic_loss(*other) != pytest.approx(expected, rel=1e-5)
+
+
 def test_the_first_step_of_adam_is_that_of_the_official_optimiser():
-    """Clipped to a norm of 1000, then lr * g / (|g| + eps): bias correction cancels."""
+    """lr * g / (|g| + eps): bias correction cancels, and so would clipping."""
     state, config = learner(), CONFIG.optimizer
-    imagination = CONFIG.imagination
-    contexts = as_batch(trajectory((imagination.batch_size, imagination.context_length), 1))
-    update = jax.jit(make_update(AGENT, CONFIG))
-    after, _, _ = update(state, as_batch(DATA), contexts, key_update(), jnp.asarray(1))
+    after, _ = update(state)
     official = float64(gradient())
     norm = np.sqrt(sum((g**2).sum() for g in jax.tree.leaves(official)))
     clipped = jax.tree.map(lambda g: g * min(1.0, config.clip / norm), official)
