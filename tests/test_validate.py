@@ -258,24 +258,15 @@ CUSTOM_STORM = changed("size", "custom", STORM)
         ),
         (
             changed("world_model.positions", 31, STORM),
-            "replay.batch_length=32: a sequence of 32 has no position in the transformer: "
-            "use less, or more world_model.positions than 31",
-        ),
-        (
-            changed("world_model.act_context", 65, STORM),
-            "world_model.act_context=65: a sequence of 65 has no position",
-        ),
-        (
-            changed("imagination.horizon", 57, STORM),
-            "imagination.horizon=57: a sequence of 65 after 8 of context has no position",
+            "replay.batch_length=32: use at most world_model.positions=31",
         ),
         (
             changed("imagination.horizon", 25, STORM),
-            "imagination.horizon=25: needs 33 positions, of which training sees replay.batch_",
+            "imagination.horizon=25: use at most 24, or longer batches than 32: training sees",
         ),
         (
             changed("world_model.act_context", 33, STORM),
-            "world_model.act_context=33: needs 33 positions",
+            "world_model.act_context=33: use at most 32, or longer batches",
         ),
         (
             changed("world_model.deter", 126, CUSTOM_STORM),

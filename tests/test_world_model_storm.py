@@ -12,7 +12,8 @@ from test_nets import noisy
 from vawm.agent import make_agent, parameter_count
 from vawm.presets import STORM, STORM_QUICK
 from vawm.types import EnvSpec, image, vector
-from vawm.world_model.storm import Window, remember, storm
+from vawm.world_model.storm import storm
+from vawm.world_model.window import Window, remember
 
 SPEC = EnvSpec("test", vector(2), 3, False, 2, 1, None)
 # The official code's, for RGB images of 64 x 64 and 18 actions.

@@ -13,7 +13,7 @@ from vawm.config import ActorConfig, CriticConfig
 from vawm.distributions import Policy
 from vawm.errors import InvalidInput
 from vawm.transforms import TwoHot
-from vawm.types import Array, EnvSpec, Key, Latent, PyTree
+from vawm.types import Array, EnvSpec, Key, Latent, PyTree, flat_stoch
 
 
 class Actor(NamedTuple):
@@ -34,7 +34,7 @@ class Critic(NamedTuple):
 
 def features(latent: Latent) -> tuple[Array, Array]:
     """[h, z] as the pair of inputs that networks read."""
-    return latent.deter, latent.stoch.reshape(*latent.stoch.shape[:-2], -1)
+    return latent.deter, flat_stoch(latent.stoch)
 
 
 def make_actor(

@@ -200,7 +200,6 @@ def describe(config: Config) -> str:
 def _describe_alignment(config: Config) -> str:
     """From when on value alignment is active, and for how much of the run."""
     alignment = config.value_alignment
-    paper = presets.of(config).get("paper", presets.PAPER)
     if alignment.weight == "off":
         return "off"
     in_updates = alignment.warmup_unit == "updates"
@@ -214,8 +213,10 @@ def _describe_alignment(config: Config) -> str:
     percent = 100 * (length - warmup) // length
     share = f"{about}{percent} %" if percent else "less than 1 %"
     text = f"active after {warmup:,} {unit}, for {share} of the run"
-    short = is_small(config) and config.env_steps < paper.env_steps
-    if short and not in_updates and warmup == scaled_warmup(config, config.env_steps):
+    paper = presets.of(config).get("paper")
+    if paper is None or not is_small(config) or config.env_steps >= paper.env_steps:
+        return text
+    if not in_updates and warmup == scaled_warmup(config, config.env_steps):
         scale = f"{paper.value_alignment.warmup_steps:,} of {paper.env_steps:,}"
         text += f"; the warm-up is shortened with the run (paper: {scale})"
     return text

@@ -130,55 +130,42 @@ def make_update_in_turn(agent: Agent, config: Config, optimizers: optim.Adams) -
     world_model_loss = make_world_model_loss(agent, config)
     behaviour_loss = make_behaviour_loss(agent, config)
 
-    def of_world_model(world_model: PyTree, params: Params, *arguments):
-        return world_model_loss(params._replace(world_model=world_model), *arguments)
-
-    def of_behaviour(behaviour: tuple[PyTree, PyTree], params: Params, *arguments):
-        actor, critic = behaviour
-        return behaviour_loss(params._replace(actor=actor, critic=critic), *arguments)
-
     def update(
         learner: Learner, batch: Batch, contexts: PyTree, key: Key, env_steps: Array
     ) -> tuple[Learner, Stored, Metrics]:
         key_model, key_behaviour = jax.random.split(key)
-        params, opt_state = learner.params, learner.opt_state
-        (model_loss, (inference, state, metrics)), gradient = jax.value_and_grad(
-            of_world_model, has_aux=True
-        )(
-            params.world_model,
-            params,
-            learner.model_state,
-            learner.slow_critic,
-            batch,
-            key_model,
-            warmup_step(config, learner, env_steps),
-        )
-        updates, model_opt = optimizers.world_model.update(gradient, opt_state.world_model)
-        params = params._replace(world_model=optax.apply_updates(params.world_model, updates))
-        metrics |= norms("optimizer", gradient, updates)
+        before, opt_state, slow_critic = learner.params, learner.opt_state, learner.slow_critic
+        step = warmup_step(config, learner, env_steps)
 
-        behaviour = params.actor, params.critic
-        (agent_loss, (return_scale, agent_metrics)), gradient = jax.value_and_grad(
-            of_behaviour, has_aux=True
-        )(
-            behaviour,
-            params,
-            state,
-            learner.slow_critic,
-            learner.return_scale,
-            batch,
-            jax.lax.stop_gradient(inference),
-            contexts,
-            key_behaviour,
-        )
+        def model_loss(world_model: PyTree):
+            params = before._replace(world_model=world_model)
+            state = learner.model_state
+            return world_model_loss(params, state, slow_critic, batch, key_model, step)
+
+        (loss, (inference, state, metrics)), gradient = jax.value_and_grad(
+            model_loss, has_aux=True
+        )(before.world_model)
+        updates, model_opt = optimizers.world_model.update(gradient, opt_state.world_model)
+        world_model = optax.apply_updates(before.world_model, updates)
+        metrics |= norms("optimizer", gradient, updates) | {"loss/total": loss}
+        inference = jax.lax.stop_gradient(inference)
+
+        def agent_loss(behaviour: tuple[PyTree, PyTree]):
+            params, scale = Params(world_model, *behaviour), learner.return_scale
+            start = inference, contexts, key_behaviour
+            return behaviour_loss(params, state, slow_critic, scale, batch, *start)
+
+        behaviour = before.actor, before.critic
+        (loss, (return_scale, agent_metrics)), gradient = jax.value_and_grad(
+            agent_loss, has_aux=True
+        )(behaviour)
         updates, behaviour_opt = optimizers.behaviour.update(gradient, opt_state.behaviour)
-        actor, critic = optax.apply_updates(behaviour, updates)
         metrics |= agent_metrics | norms("optimizer/behaviour", gradient, updates)
-        metrics["loss/total"] = model_loss + agent_loss
+        metrics["loss/total"] += loss
         learner = advance(
             learner,
             config,
-            params=Params(params.world_model, actor, critic),
+            params=Params(world_model, *optax.apply_updates(behaviour, updates)),
             model_state=state,
             opt_state=optim.Adams(model_opt, behaviour_opt),
             return_scale=return_scale,

@@ -10,6 +10,7 @@ or one after the other.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from typing import NamedTuple
@@ -97,8 +98,7 @@ def make_world_model_loss(agent: Agent, config: Config):
     model = config.world_model
     value_alignment = make_value_alignment(agent, config)
     reward_code = transforms.make_two_hot(model.bins, model.bin_spacing)
-    plain = model.continue_target == "plain"
-    discount = 1.0 if plain else discount_of(config)
+    discount = 1.0 if model.continue_target == "plain" else discount_of(config)
     of_batch = model.free_nats_of == "batch"
     dynamics_loss = losses.batch_dynamics_loss if of_batch else losses.dynamics_loss
 
@@ -177,6 +177,24 @@ class Foresight(NamedTuple):
     weight: Array  # [H, N] probability, by the continue head, of getting there; or 1
 
 
+def read_discount(config: Config, logit: Array) -> Array:
+    """gamma * P(continue) of a continue logit; or gamma where that is likely, else 0."""
+    gamma, plain = discount_of(config), config.world_model.continue_target == "plain"
+    if config.imagination.continuation == "threshold":
+        # One half, or the logit of gamma / 2 where gamma is learned along.
+        limit = 0.0 if plain else math.log(gamma / (2.0 - gamma))
+        return gamma * (logit >= limit).astype(logit.dtype)
+    return gamma * jax.nn.sigmoid(logit) if plain else jax.nn.sigmoid(logit)
+
+
+def imagined_returns(config: Config, reward: Array, discount: Array, value: Array) -> Array:
+    """Lambda-returns `[H, N]` from what arrived with s_0..s_H and the values there."""
+    lambda_, arrived = config.imagination.lambda_, (reward[1:], discount[1:])
+    if config.imagination.value_index == "current":
+        return returns.lambda_returns(*arrived, value[:-1], value[-1], lambda_=lambda_)
+    return returns.lambda_returns(*arrived, value[1:], lambda_=lambda_)
+
+
 def make_foresight(agent: Agent, config: Config):
     """Build `foresight(params, state, slow_critic, scale, inference, contexts, key)`.
 
@@ -188,7 +206,7 @@ def make_foresight(agent: Agent, config: Config):
     reward_code = transforms.make_two_hot(model.bins, model.bin_spacing)
     actor, critic, world_model = agent.actor, agent.critic, agent.world_model
     horizon = imagination.horizon
-    undiscounted = model.continue_target == "plain"
+    returns_of = functools.partial(imagined_returns, config)
 
     def begin(params: PyTree, state: PyTree, inference: Inference, contexts: PyTree, key: Key):
         if imagination.starts == "contexts":
@@ -196,25 +214,6 @@ def make_foresight(agent: Agent, config: Config):
             return world_model.follow(params, state, key, contexts, horizon=horizon + 1)[1]
         assert world_model.starts is not None
         return world_model.starts(params, state, inference)
-
-    def read_discount(logit: Array) -> Array:
-        """gamma * P(continue), or gamma where an episode is expected to go on, else 0."""
-        gamma = discount_of(config)
-        if imagination.continuation == "threshold":
-            half = (
-                0.0 if undiscounted else math.log(gamma / (2.0 - gamma))
-            )  # logit of gamma / 2
-            return gamma * (logit >= half).astype(logit.dtype)
-        cont = jax.nn.sigmoid(logit)
-        return gamma * cont if undiscounted else cont
-
-    def returns_of(reward: Array, discount: Array, value: Array) -> Array:
-        """`[H, N]` from what arrived with s_0..s_H and the values there."""
-        index = {"next": (value[1:], None), "current": (value[:-1], value[-1])}
-        mixed = index[imagination.value_index]
-        return returns.lambda_returns(
-            reward[1:], discount[1:], *mixed, lambda_=imagination.lambda_
-        )
 
     def slow_target_of(params: PyTree, latent: Latent, reward: Array, discount: Array) -> Array:
         if config.critic.slow_target == "returns":
@@ -249,7 +248,7 @@ def make_foresight(agent: Agent, config: Config):
         # 5. Lambda-returns and their scale, Eq. 7 and 9.
         predictions = world_model.predict(frozen.world_model, state, imagined.latent)
         reward = reward_code.mean(predictions.reward)
-        discount = read_discount(predictions.cont)
+        discount = read_discount(config, predictions.cont)
         logits = critic.logits(params.critic, imagined.latent)
         value = critic.code.mean(jax.lax.stop_gradient(logits))
         target = returns_of(reward, discount, value)

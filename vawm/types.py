@@ -102,6 +102,11 @@ class Latent(NamedTuple):
     stoch: Array  # [..., S, K] one-hot, straight-through
 
 
+def flat_stoch(stoch: Array) -> Array:
+    """z as one vector: `[..., S, K]` -> `[..., S * K]`."""
+    return stoch.reshape(*stoch.shape[:-2], -1)
+
+
 class Inference(NamedTuple):
     """States that a world model has both inferred and predicted, `[B, T, ...]`.
 

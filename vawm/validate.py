@@ -204,31 +204,19 @@ def _check_imagination(config: Config) -> None:
     if not from_contexts:
         remedy = "use contexts: a transformer has no state to start from but its past"
         raise InvalidInput("imagination.starts", imagination.starts, remedy)
-    lengths = {
-        "replay.batch_length": config.replay.batch_length,
-        "world_model.act_context": model.act_context,
-        "imagination.horizon": imagination.context_length + imagination.horizon,
-    }
-    for name, length in lengths.items():
-        if length > model.positions:
-            beyond = f" after {imagination.context_length} of context" * name.endswith(
-                "horizon"
-            )
-            remedy = (
-                f"a sequence of {length}{beyond} has no position in the transformer: use less, "
-                f"or more world_model.positions than {model.positions}"
-            )
-            raise InvalidInput(name, _get(config, name), remedy)
-        if length > config.replay.batch_length:
-            remedy = (
-                f"needs {length} positions, of which training sees "
-                f"replay.batch_length={config.replay.batch_length}: use less, or longer batches"
-            )
-            raise InvalidInput(name, _get(config, name), remedy)
-
-
-def _get(config: Config, name: str) -> Any:
-    return dict(values(config))[name]
+    length = config.replay.batch_length
+    if length > model.positions:
+        remedy = f"use at most world_model.positions={model.positions}"
+        raise InvalidInput("replay.batch_length", length, remedy)
+    # Training sees the first positions, as many as a batch is long.
+    needs = (
+        ("world_model.act_context", model.act_context, 0),
+        ("imagination.horizon", imagination.horizon, imagination.context_length),
+    )
+    for name, value, before in needs:
+        if before + value > length:
+            remedy = f"use at most {length - before}, or longer batches than {length}: "
+            raise InvalidInput(name, value, remedy + "training sees no later position")
 
 
 def _first_update(config: Config) -> int:

@@ -6,13 +6,15 @@ and images. Tokens are those of the vectors, then those of the images.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from vawm import nets
 from vawm.errors import InvalidInput
+from vawm.transforms import symlog
 from vawm.types import IMAGE_SIZES, Array, EnvSpec, Key, PyTree, is_image
 
 
@@ -25,7 +27,8 @@ class Codec(NamedTuple):
       init_encoder, init_decoder: `(key) -> (params, state)`.
       encode: `(params, state, obs, *, train) -> (tokens, state)`, `[..., token_size]`; `obs`
         are the arrays of this kind, in the order of the tree that an observation is.
-      decode: `(params, state, latent, *, train) -> (predictions, state)` of these arrays.
+      decode: `(params, state, latent, *, train) -> (predictions, state)` of these arrays;
+        `latent` are the parts of s that the decoder reads.
       token_size: width of the tokens.
     """
 
@@ -118,6 +121,43 @@ def make_codecs(
         decode=decode,
         token_size=sum(codec.token_size for codec in codecs.values()),
     )
+
+
+def vector_codec(
+    encoder: nets.MLP | nets.ReluMLP,
+    decoder: nets.MLP | nets.ReluMLP,
+    *,
+    widths: list[int],
+    latent: Sequence[int],
+    token_size: int,
+) -> Codec:
+    """Symlog MLPs: the encoder reads symlog(o), the decoder predicts symlog(o); no state.
+
+    Args:
+      encoder: one without outputs.
+      decoder: one with an output for each vector.
+      widths: of the vectors.
+      latent: widths of what the decoder reads.
+      token_size: of the encoder.
+    """
+
+    def init_encoder(key: Key) -> tuple[PyTree, PyTree]:
+        return encoder.init(key, jnp.zeros((1, sum(widths))))["params"], ()
+
+    def init_decoder(key: Key) -> tuple[PyTree, PyTree]:
+        inputs = [jnp.zeros((1, width)) for width in latent]
+        return decoder.init(key, *inputs)["params"], ()
+
+    def encode(params: PyTree, state: PyTree, obs: list[Array], *, train: bool):
+        del train
+        vector = obs[0] if len(obs) == 1 else jnp.concatenate(obs, -1)
+        return jnp.asarray(encoder.apply({"params": params}, symlog(vector))), state
+
+    def decode(params: PyTree, state: PyTree, latent: tuple[Array, ...], *, train: bool):
+        del train
+        return list(decoder.apply({"params": params}, *latent)), state
+
+    return Codec(init_encoder, init_decoder, encode, decode, token_size)
 
 
 def join_pixels(images: list[Array]) -> Array:

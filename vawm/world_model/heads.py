@@ -10,9 +10,11 @@ import jax.numpy as jnp
 
 from vawm import nets
 from vawm.config import RSSMConfig
-from vawm.transforms import symlog
-from vawm.types import Array, EnvSpec, Key, Latent, Predictions, PyTree
-from vawm.world_model.codecs import Codec, join_pixels, make_codecs, split_pixels
+from vawm.types import Array, EnvSpec, Key, Latent, Predictions, PyTree, flat_stoch
+from vawm.world_model import codecs
+from vawm.world_model.codecs import Codec, Codecs, join_pixels, split_pixels
+
+Network = nets.MLP | nets.ReluMLP
 
 
 class Heads(NamedTuple):
@@ -22,11 +24,6 @@ class Heads(NamedTuple):
     encode: Callable[[PyTree, PyTree, PyTree], Array]
     predict: Callable[[PyTree, PyTree, Latent], Predictions]
     token_size: int
-
-
-def flat_stoch(latent: Latent) -> Array:
-    """z as one vector, `[..., S * K]`."""
-    return latent.stoch.reshape(*latent.stoch.shape[:-2], -1)
 
 
 def make_heads(config: RSSMConfig, spec: EnvSpec, dtype: jnp.dtype) -> Heads:
@@ -39,7 +36,7 @@ def make_heads(config: RSSMConfig, spec: EnvSpec, dtype: jnp.dtype) -> Heads:
       InvalidInput: an observation that is neither a vector nor a square image whose
         halvings fit.
     """
-    codecs = make_codecs(
+    codec = codecs.make_codecs(
         spec,
         vector=lambda widths: vector_codec(config, widths, dtype),
         image=lambda size, channels: image_codec(config, size, channels, dtype),
@@ -52,57 +49,63 @@ def make_heads(config: RSSMConfig, spec: EnvSpec, dtype: jnp.dtype) -> Heads:
     reward = mlp(config.reward_layers, config.bins, 0.0)
     cont = mlp(config.continue_layers, 1, 1.0)
 
+    outcome = make_outcome(reward, cont)
+
     def init(key: Key) -> tuple[PyTree, PyTree]:
-        key_encoder, key_decoder, key_reward, key_cont = jax.random.split(key, 4)
-        feature = jnp.zeros((1, features))
-        encoder, encoder_state = codecs.init_encoder(key_encoder)
-        decoder, decoder_state = codecs.init_decoder(key_decoder)
-        params = {
-            "encoder": encoder,
-            "decoder": decoder,
-            "reward": reward.init(key_reward, feature)["params"],
-            "cont": cont.init(key_cont, feature)["params"],
-        }
-        return params, {"encoder": encoder_state, "decoder": decoder_state}
+        return init_heads(key, codec, reward, cont, jnp.zeros((1, features)))
 
     def encode(params: PyTree, state: PyTree, obs: PyTree) -> Array:
-        return codecs.encode(params["encoder"], state["encoder"], obs, train=False)[0]
+        return codec.encode(params["encoder"], state["encoder"], obs, train=False)[0]
 
     def predict(params: PyTree, state: PyTree, latent: Latent) -> Predictions:
-        feature = latent.deter, flat_stoch(latent)
-        obs, _ = codecs.decode(params["decoder"], state["decoder"], feature, train=False)
+        feature = latent.deter, flat_stoch(latent.stoch)
+        obs, _ = codec.decode(params["decoder"], state["decoder"], feature, train=False)
+        return Predictions(obs, *outcome(params, *feature))
+
+    return Heads(init, encode, predict, codec.token_size)
+
+
+def init_heads(
+    key: Key, codec: Codecs, reward: Network, cont: Network, feature: Array
+) -> tuple[PyTree, PyTree]:
+    """Parameters and state of all heads; `feature` is what reward and continuation read."""
+    key_encoder, key_decoder, key_reward, key_cont = jax.random.split(key, 4)
+    encoder, encoder_state = codec.init_encoder(key_encoder)
+    decoder, decoder_state = codec.init_decoder(key_decoder)
+    params = {
+        "encoder": encoder,
+        "decoder": decoder,
+        "reward": reward.init(key_reward, feature)["params"],
+        "cont": cont.init(key_cont, feature)["params"],
+    }
+    return params, {"encoder": encoder_state, "decoder": decoder_state}
+
+
+def make_outcome(reward: Network, cont: Network) -> Callable[..., tuple[Array, Array]]:
+    """Build `outcome(params, *feature) -> (logits, logit)` of reward and continuation.
+
+    `[..., bins]` and `[...]`, both float32.
+    """
+
+    def outcome(params: PyTree, *feature: Array) -> tuple[Array, Array]:
         logits = reward.apply({"params": params["reward"]}, *feature)[0]
         logit = cont.apply({"params": params["cont"]}, *feature)[0]
-        return Predictions(obs, logits.astype(jnp.float32), logit[..., 0].astype(jnp.float32))
+        return logits.astype(jnp.float32), logit[..., 0].astype(jnp.float32)
 
-    return Heads(init, encode, predict, codecs.token_size)
+    return outcome
 
 
 def vector_codec(config: RSSMConfig, widths: list[int], dtype: jnp.dtype) -> Codec:
-    """Symlog MLPs: the encoder reads symlog(o), the decoder predicts symlog(o)."""
-    features = config.deter + config.stoch * config.classes
-    units, outputs = config.units, tuple(widths)
-    encoder = nets.MLP(sum(widths), config.encoder_layers, units, dtype=dtype)
-    decoder = nets.MLP(
-        features, config.decoder_layers, units, outputs, (1.0,) * len(widths), dtype
+    """MLPs: the decoder reads h and z."""
+    latent, units = (config.deter, config.stoch * config.classes), config.units
+    scales = (1.0,) * len(widths)
+    return codecs.vector_codec(
+        nets.MLP(sum(widths), config.encoder_layers, units, dtype=dtype),
+        nets.MLP(sum(latent), config.decoder_layers, units, tuple(widths), scales, dtype),
+        widths=widths,
+        latent=latent,
+        token_size=units,
     )
-
-    def init_encoder(key: Key) -> tuple[PyTree, PyTree]:
-        return encoder.init(key, jnp.zeros((1, sum(widths))))["params"], ()
-
-    def init_decoder(key: Key) -> tuple[PyTree, PyTree]:
-        return decoder.init(key, jnp.zeros((1, features)))["params"], ()
-
-    def encode(params: PyTree, state: PyTree, obs: list[Array], *, train: bool):
-        del train
-        vector = obs[0] if len(obs) == 1 else jnp.concatenate(obs, -1)
-        return jnp.asarray(encoder.apply({"params": params}, symlog(vector))), state
-
-    def decode(params: PyTree, state: PyTree, latent: tuple[Array, Array], *, train: bool):
-        del train
-        return list(decoder.apply({"params": params}, *latent)), state
-
-    return Codec(init_encoder, init_decoder, encode, decode, units)
 
 
 def image_codec(config: RSSMConfig, size: int, channels: list[int], dtype: jnp.dtype) -> Codec:

@@ -20,8 +20,9 @@ from vawm.types import (
     Latent,
     PyTree,
     Targets,
+    flat_stoch,
 )
-from vawm.world_model.heads import flat_stoch, make_heads
+from vawm.world_model.heads import make_heads
 from vawm.world_model.protocol import Imagination, WorldModel
 
 
@@ -110,7 +111,7 @@ def rssm(
 
         def step(latent: Latent, inputs):
             keep, drive, tokens, uniform = inputs
-            deter, stoch = latent.deter * keep, flat_stoch(latent) * keep
+            deter, stoch = latent.deter * keep, flat_stoch(latent.stoch) * keep
             deter = apply(params, nets.RSSM.advance, deter, stoch, drive)
             logits = apply(params, nets.RSSM.posterior, deter, tokens)
             latent = Latent(deter, sample(logits, uniform))
@@ -184,7 +185,7 @@ def rssm(
         blocks, latent = carry
         drive = apply(params, lambda m, a: m.gru.drive(a), action.astype(dtype))
         blocks, deter, logits = apply(
-            params, nets.RSSM.imagine, blocks, latent.deter, flat_stoch(latent), drive
+            params, nets.RSSM.imagine, blocks, latent.deter, flat_stoch(latent.stoch), drive
         )
         uniform = jax.random.uniform(key, logits.shape[:-1])
         latent = Latent(deter, sample(logits, uniform))

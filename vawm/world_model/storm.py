@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+import functools
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -21,23 +22,11 @@ from vawm.types import (
     Predictions,
     PyTree,
     Targets,
+    flat_stoch,
 )
-from vawm.world_model.heads import flat_stoch
 from vawm.world_model.protocol import Imagination, WorldModel
 from vawm.world_model.storm_heads import make_storm_heads
-
-
-class Window(NamedTuple):
-    """What acting remembers: the last steps that are over, and the one that is not.
-
-    Steps begin at index 0, the oldest first; those beyond `length` mean nothing.
-    """
-
-    obs: PyTree  # [N, C, ...]
-    action: Array  # [N, C, A], what left from them
-    length: Array  # [N] int32, steps held
-    latest: PyTree  # [N, ...] the observation whose action is not known yet
-    waits: Array  # [N] bool, whether there is one
+from vawm.world_model.window import Window, empty_window, remember
 
 
 def storm(
@@ -73,7 +62,6 @@ def storm(
       noise: whether z~ is sampled with its own noise or with the noise of z.
     """
     heads = make_storm_heads(config, spec, dtype)
-    flat = config.stoch * config.classes
     net = nets.Storm(
         width=config.deter,
         heads=config.heads,
@@ -96,28 +84,10 @@ def storm(
 
     def init(key: Key) -> tuple[PyTree, PyTree]:
         key_net, key_heads = jax.random.split(key)
-        tokens, action = (
-            jnp.zeros((1, 1, heads.token_size)),
-            jnp.zeros((1, 1, spec.action_size)),
-        )
-        params = net.init(key_net, tokens, action)
+        widths = heads.token_size, spec.action_size
+        params = net.init(key_net, *(jnp.zeros((1, 1, width)) for width in widths))
         head_params, state = heads.init(key_heads)
         return {"storm": params["params"], **head_params}, state
-
-    def initial(batch_size: int) -> Window:
-        def blank(x) -> Array:
-            return jnp.zeros((batch_size, *x.shape), x.dtype)
-
-        def blanks(x) -> Array:
-            return jnp.zeros((batch_size, config.act_context, *x.shape), x.dtype)
-
-        return Window(
-            obs=jax.tree.map(blanks, spec.obs),
-            action=jnp.zeros((batch_size, config.act_context, spec.action_size)),
-            length=jnp.zeros(batch_size, jnp.int32),
-            latest=jax.tree.map(blank, spec.obs),
-            waits=jnp.zeros(batch_size, bool),
-        )
 
     def visibility(is_first: Array) -> Array:
         """`[B or 1, L, L]`: which step sees which."""
@@ -152,37 +122,34 @@ def storm(
         post_logits, stoch, uniform, state = infer(
             params, state, key_post, taken.obs, train=True
         )
+        z = flat_stoch(stoch)
         deter = apply(
             params,
             nets.Storm.read_in_training,
-            stoch.reshape(*stoch.shape[:2], flat),
+            z,
             taken.action,
             visibility(taken.is_first),
             rngs={"dropout": key_dropout},
         )
         deter = clear(deter, arrived.is_first)
         prior_logits = apply(params, nets.Storm.prior, deter)
+        uniform = uniform[:, 1:]
         if noise == "independent":
             uniform = jax.random.uniform(key_prior, uniform.shape)
-            uniform = uniform[:, :-1]
-        else:
-            uniform = uniform[:, 1:]
         inference = Inference(
             latent=Latent(deter[:, :-1], stoch[:, 1:]),
             prior_latent=Latent(deter[:, :-1], sample(prior_logits[:, :-1], uniform)),
             post_logits=post_logits[:, 1:],
             prior_logits=prior_logits[:, :-1],
         )
-        flat_z = stoch.reshape(*stoch.shape[:2], flat)
-        obs, state = heads.decode(params, state, flat_z, train=True)
+        obs, state = heads.decode(params, state, z, train=True)
         predictions = Predictions(obs, *heads.outcome(params, deter))
         targets = Targets(taken.obs, arrived.reward, arrived.is_terminal)
         return Explanation(inference, predictions, targets), state
 
     def read(params: PyTree, stoch: Array, action: Array, visible: Array):
         """h after every step, and keys and values, without dropout."""
-        z = stoch.reshape(*stoch.shape[:2], flat)
-        return apply(params, nets.Storm.read, z, action, visible)
+        return apply(params, nets.Storm.read, flat_stoch(stoch), action, visible)
 
     def expect(params: PyTree, key: Key, deter: Array) -> Latent:
         """`[N, D]` -> what the prior expects there."""
@@ -211,7 +178,7 @@ def storm(
     ) -> Imagination:
         del state
         cache, latent = carry
-        deter, cache = apply(params, nets.Storm.step, flat_stoch(latent), action, cache)
+        deter, cache = apply(params, nets.Storm.step, flat_stoch(latent.stoch), action, cache)
         latent = expect(params, key, deter)
         return (cache, latent), latent
 
@@ -241,12 +208,12 @@ def storm(
         return window._replace(latest=obs, waits=jnp.ones_like(window.waits)), latent
 
     def predict(params: PyTree, state: PyTree, latent: Latent) -> Predictions:
-        obs, _ = heads.decode(params, state, flat_stoch(latent), train=False)
+        obs, _ = heads.decode(params, state, flat_stoch(latent.stoch), train=False)
         return Predictions(obs, *heads.outcome(params, latent.deter))
 
     return WorldModel(
         init=init,
-        initial=initial,
+        initial=functools.partial(empty_window, spec, config.act_context),
         memory=lambda carry: (),
         filter=filter_step,
         explain=explain,
@@ -254,27 +221,4 @@ def storm(
         follow=follow,
         imagine=imagine,
         predict=predict,
-    )
-
-
-def remember(window: Window, action: Array) -> Window:
-    """`window` with the step that was waiting for `action`, if there was one."""
-    context = window.action.shape[1]
-    full = window.length == context
-
-    def append(past: Array, new: Array) -> Array:
-        def per_row(flag: Array) -> Array:
-            return flag.reshape(-1, *(1,) * (past.ndim - 1))
-
-        moved = jnp.where(per_row(full), jnp.roll(past, -1, axis=1), past)
-        place = jnp.where(full, context - 1, window.length)
-        here = jnp.arange(context)[None] == place[:, None]
-        here = (here & window.waits[:, None]).reshape(*here.shape, *(1,) * (past.ndim - 2))
-        appended = jnp.where(here, new[:, None], moved)
-        return jnp.where(per_row(window.waits), appended, past)
-
-    return window._replace(
-        obs=jax.tree.map(append, window.obs, window.latest),
-        action=append(window.action, action),
-        length=jnp.where(window.waits & ~full, window.length + 1, window.length),
     )

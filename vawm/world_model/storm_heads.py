@@ -10,9 +10,10 @@ import jax.numpy as jnp
 
 from vawm import nets
 from vawm.config import StormConfig
-from vawm.transforms import symlog
 from vawm.types import Array, EnvSpec, Key, PyTree
-from vawm.world_model.codecs import Codec, join_pixels, make_codecs, split_pixels
+from vawm.world_model import codecs
+from vawm.world_model.codecs import Codec, join_pixels, split_pixels
+from vawm.world_model.heads import init_heads, make_outcome
 
 
 class StormHeads(NamedTuple):
@@ -43,7 +44,7 @@ def make_storm_heads(config: StormConfig, spec: EnvSpec, dtype: jnp.dtype) -> St
       InvalidInput: an observation that is neither a vector nor a square image whose
         halvings fit.
     """
-    codecs = make_codecs(
+    codec = codecs.make_codecs(
         spec,
         vector=lambda widths: vector_codec(config, widths, dtype),
         image=lambda size, channels: image_codec(config, size, channels, dtype),
@@ -55,59 +56,29 @@ def make_storm_heads(config: StormConfig, spec: EnvSpec, dtype: jnp.dtype) -> St
     reward, cont = mlp(config.bins), mlp(1)
 
     def init(key: Key) -> tuple[PyTree, PyTree]:
-        key_encoder, key_decoder, key_reward, key_cont = jax.random.split(key, 4)
-        deter = jnp.zeros((1, config.deter))
-        encoder, encoder_state = codecs.init_encoder(key_encoder)
-        decoder, decoder_state = codecs.init_decoder(key_decoder)
-        params = {
-            "encoder": encoder,
-            "decoder": decoder,
-            "reward": reward.init(key_reward, deter)["params"],
-            "cont": cont.init(key_cont, deter)["params"],
-        }
-        return params, {"encoder": encoder_state, "decoder": decoder_state}
+        return init_heads(key, codec, reward, cont, jnp.zeros((1, config.deter)))
 
     def encode(params: PyTree, state: PyTree, obs: PyTree, *, train: bool):
-        tokens, own = codecs.encode(params["encoder"], state["encoder"], obs, train=train)
+        tokens, own = codec.encode(params["encoder"], state["encoder"], obs, train=train)
         return tokens, state | {"encoder": own}
 
     def decode(params: PyTree, state: PyTree, stoch: Array, *, train: bool):
-        obs, own = codecs.decode(params["decoder"], state["decoder"], stoch, train=train)
+        obs, own = codec.decode(params["decoder"], state["decoder"], (stoch,), train=train)
         return obs, state | {"decoder": own}
 
-    def outcome(params: PyTree, deter: Array) -> tuple[Array, Array]:
-        logits = reward.apply({"params": params["reward"]}, deter)[0]
-        logit = cont.apply({"params": params["cont"]}, deter)[0]
-        return logits.astype(jnp.float32), logit[..., 0].astype(jnp.float32)
-
-    return StormHeads(init, encode, decode, outcome, codecs.token_size)
+    return StormHeads(init, encode, decode, make_outcome(reward, cont), codec.token_size)
 
 
 def vector_codec(config: StormConfig, widths: list[int], dtype: jnp.dtype) -> Codec:
-    """Symlog MLPs, which the paper has not: the decoder predicts symlog(o).
-
-    Their norm is the heads' LayerNorm, so there are no statistics.
-    """
+    """MLPs, which the paper has not; their norm is LayerNorm, so there are no statistics."""
     flat, layers, units = config.stoch * config.classes, config.vector_layers, config.units
-    encoder = nets.ReluMLP(sum(widths), layers, units, dtype=dtype)
-    decoder = nets.ReluMLP(flat, layers, units, tuple(widths), dtype)
-
-    def init_encoder(key: Key) -> tuple[PyTree, PyTree]:
-        return encoder.init(key, jnp.zeros((1, sum(widths))))["params"], ()
-
-    def init_decoder(key: Key) -> tuple[PyTree, PyTree]:
-        return decoder.init(key, jnp.zeros((1, flat)))["params"], ()
-
-    def encode(params: PyTree, state: PyTree, obs: list[Array], *, train: bool):
-        del train
-        vector = obs[0] if len(obs) == 1 else jnp.concatenate(obs, -1)
-        return jnp.asarray(encoder.apply({"params": params}, symlog(vector))), state
-
-    def decode(params: PyTree, state: PyTree, stoch: Array, *, train: bool):
-        del train
-        return list(decoder.apply({"params": params}, stoch)), state
-
-    return Codec(init_encoder, init_decoder, encode, decode, units)
+    return codecs.vector_codec(
+        nets.ReluMLP(sum(widths), layers, units, dtype=dtype),
+        nets.ReluMLP(flat, layers, units, tuple(widths), dtype),
+        widths=widths,
+        latent=(flat,),
+        token_size=units,
+    )
 
 
 def image_codec(config: StormConfig, size: int, channels: list[int], dtype: jnp.dtype) -> Codec:
@@ -135,7 +106,8 @@ def image_codec(config: StormConfig, size: int, channels: list[int], dtype: jnp.
         tokens, state = apply(encoder, params, state, join_pixels(obs), train)
         return tokens.reshape(*obs[0].shape[:-3], -1), state
 
-    def decode(params: PyTree, state: PyTree, stoch: Array, *, train: bool):
+    def decode(params: PyTree, state: PyTree, latent: tuple[Array], *, train: bool):
+        (stoch,) = latent
         pixels, state = apply(decoder, params, state, stoch.reshape(-1, flat), train)
         pixels = pixels.reshape(*stoch.shape[:-1], *pixels.shape[1:])
         return split_pixels(pixels, channels), state

@@ -1,0 +1,61 @@
+"""A window over the last steps: what an agent without a recurrent state remembers."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from vawm.types import Array, EnvSpec, PyTree
+
+
+class Window(NamedTuple):
+    """What acting remembers: the last steps that are over, and the one that is not.
+
+    Steps begin at index 0, the oldest first; those beyond `length` mean nothing.
+    """
+
+    obs: PyTree  # [N, C, ...]
+    action: Array  # [N, C, A], what left from them
+    length: Array  # [N] int32, steps held
+    latest: PyTree  # [N, ...] the observation whose action is not known yet
+    waits: Array  # [N] bool, whether there is one
+
+
+def empty_window(spec: EnvSpec, context: int, batch_size: int) -> Window:
+    """Room for `context` steps, none of them there yet."""
+
+    def room(shape: tuple[int, ...]) -> PyTree:
+        return jax.tree.map(lambda x: jnp.zeros((*shape, *x.shape), x.dtype), spec.obs)
+
+    return Window(
+        obs=room((batch_size, context)),
+        action=jnp.zeros((batch_size, context, spec.action_size)),
+        length=jnp.zeros(batch_size, jnp.int32),
+        latest=room((batch_size,)),
+        waits=jnp.zeros(batch_size, bool),
+    )
+
+
+def remember(window: Window, action: Array) -> Window:
+    """`window` with the step that was waiting for `action`, if there was one."""
+    context = window.action.shape[1]
+    full = window.length == context
+
+    def append(past: Array, new: Array) -> Array:
+        def per_row(flag: Array) -> Array:
+            return flag.reshape(-1, *(1,) * (past.ndim - 1))
+
+        moved = jnp.where(per_row(full), jnp.roll(past, -1, axis=1), past)
+        place = jnp.where(full, context - 1, window.length)
+        here = jnp.arange(context)[None] == place[:, None]
+        here = (here & window.waits[:, None]).reshape(*here.shape, *(1,) * (past.ndim - 2))
+        appended = jnp.where(here, new[:, None], moved)
+        return jnp.where(per_row(window.waits), appended, past)
+
+    return window._replace(
+        obs=jax.tree.map(append, window.obs, window.latest),
+        action=append(window.action, action),
+        length=jnp.where(window.waits & ~full, window.length + 1, window.length),
+    )
