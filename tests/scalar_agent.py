@@ -29,6 +29,7 @@ from vawm.types import (
     Targets,
     vector,
 )
+from vawm.world_model.packing import pack
 from vawm.world_model.protocol import WorldModel
 
 CONFIG = dataclasses.replace(  # no scale is 1, so that none can be forgotten unseen
@@ -129,7 +130,7 @@ AGENT = Agent(
     world_model=WorldModel(
         init=lambda key: (PARAMS.world_model, ()),
         initial=lambda batch_size: latent(jnp.zeros(batch_size), jnp.zeros(batch_size)),
-        memory=lambda latent: latent,
+        memory=pack,
         filter=None,
         explain=explain,
         starts=starts,

@@ -64,7 +64,7 @@ def test_what_is_taken_apart_is_whole_again_also_after_the_ring_has_wrapped(step
         batch_size=6,
         length=3,
     )
-    read = replay.read(buffer, positions, classes=2)
+    read = replay.read(buffer, positions)
     whole = image_store.complete(read, image_store.read(store, positions))
     trajectory, context = whole
     toy.assert_equal(context, read.context)

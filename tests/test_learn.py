@@ -53,7 +53,7 @@ def test_a_batch_has_a_step_more_than_it_replays_and_contexts_have_their_own_len
     assert drawn.contexts.time.shape == (5, 3)
     for positions in drawn:
         assert positions.env.shape == positions.time.shape[:1]
-        reward = replay.read(full(), positions, classes=4).trajectory.reward
+        reward = replay.read(full(), positions).trajectory.reward
         assert (np.diff(reward, axis=1) == 1).all()  # consecutive, in one stream
 
 

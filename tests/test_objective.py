@@ -44,7 +44,7 @@ def batch(agent):
         is_terminal=flags,
         action=jax.random.normal(keys[2], (*shape, 1)),
     )
-    return Batch(trajectory, agent.world_model.initial(BATCH))
+    return Batch(trajectory, agent.world_model.memory(agent.world_model.initial(BATCH)))
 
 
 @functools.cache

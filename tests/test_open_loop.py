@@ -31,7 +31,7 @@ def batch(agent, seed=0, first=()):
     trajectory = Trajectory(
         jax.tree.map(draw, agent.spec.obs), jnp.zeros(shape), is_first, flag, flag, action
     )
-    return Batch(trajectory, agent.world_model.initial(BATCH))
+    return Batch(trajectory, agent.world_model.memory(agent.world_model.initial(BATCH)))
 
 
 def predict(agent, data, params, state):

@@ -15,6 +15,7 @@ from vawm.agent import make_agent
 from vawm.learn import make_learn
 from vawm.learner import init_learner
 from vawm.types import Trajectory
+from vawm.world_model.packing import pack
 
 
 def make(config=tiny.CONFIG, env=None):
@@ -197,7 +198,7 @@ def scalar_experience():
     obs, action = (jnp.asarray(rng.normal(size=(*shape, 1)), jnp.float32) for _ in range(2))
     trajectory = Trajectory(obs, jnp.zeros(shape), no, no, no, action)
     latent = scalar_agent.latent(jnp.asarray(rng.normal(size=shape)), jnp.ones(shape))
-    return replay.Replay(trajectory, replay.pack(latent), head=jnp.int32(3), size=jnp.int32(8))
+    return replay.Replay(trajectory, pack(latent), head=jnp.int32(3), size=jnp.int32(8))
 
 
 def test_latents_are_written_back_to_exactly_the_steps_they_were_inferred_at():
@@ -211,7 +212,7 @@ def test_latents_are_written_back_to_exactly_the_steps_they_were_inferred_at():
     draw = functools.partial(replay.draw, batch_size=2, length=length)
     key_draw = jax.random.split(jax.random.key(1), 3)[1]
     env, time = positions = jax.device_get(jax.jit(draw)(before, key_draw))
-    trajectory, context = jax.device_get(replay.read(before, positions, classes=2))
+    trajectory, context = jax.device_get(replay.read(before, positions))
     assert env[0] != env[1]  # no step is in both samples
     deter, stoch = (np.array(x) for x in before.latent)
     for b in range(2):

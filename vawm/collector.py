@@ -16,7 +16,7 @@ from vawm import replay
 from vawm.agent import Agent, PolicyCarry
 from vawm.config import Config
 from vawm.envs.protocol import Environment
-from vawm.replay import Replay, Stored
+from vawm.replay import Replay
 from vawm.types import Array, Key, Metrics, Params, PyTree, TimeStep, Trajectory
 
 
@@ -32,10 +32,10 @@ class Collector(NamedTuple):
 
 
 class Departure(NamedTuple):
-    """What an action leaves behind: the step to store, and the latent inferred there."""
+    """What an action leaves behind: the step to store, and what is kept beside it."""
 
     trajectory: Trajectory  # [N, ...]
-    latent: Stored  # [N, ...]
+    latent: PyTree  # [N, ...]
 
 
 Collect = Callable[[Params, PyTree, Collector, Replay, Key], tuple[Collector, Replay, Metrics]]

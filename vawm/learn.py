@@ -75,7 +75,6 @@ def make_update_at(agent: Agent, config: Config) -> UpdateAt:
     learner, replay and metrics. `images` are those of the same steps where replay keeps none.
     """
     update = make_update(agent, config)
-    classes = config.world_model.classes
 
     def update_at(
         learner: Learner,
@@ -86,7 +85,7 @@ def make_update_at(agent: Agent, config: Config) -> UpdateAt:
         env_steps: Array,
     ) -> tuple[Learner, Replay, Metrics]:
         def read(at: Positions, images: PyTree):
-            return image_store.complete(replay.read(buffer, at, classes=classes), images)
+            return image_store.complete(replay.read(buffer, at), images)
 
         batch = read(positions.batch, images.batch)
         contexts = positions.contexts and read(positions.contexts, images.contexts)

@@ -18,7 +18,6 @@ from vawm import optim, returns
 from vawm.agent import Agent
 from vawm.config import AdamConfig, Config, LaPropConfig
 from vawm.objective import make_behaviour_loss, make_world_model_loss
-from vawm.replay import Stored
 from vawm.types import Array, Batch, Key, Metrics, Params, PyTree
 
 
@@ -33,7 +32,7 @@ class Learner(NamedTuple):
     return_scale: returns.ReturnScale
 
 
-Update = Callable[[Learner, Batch, PyTree, Key, Array], tuple[Learner, Stored, Metrics]]
+Update = Callable[[Learner, Batch, PyTree, Key, Array], tuple[Learner, PyTree, Metrics]]
 
 
 def init_learner(agent: Agent, config: Config, key: Key) -> Learner:
@@ -106,7 +105,7 @@ def make_joint_update(
 
     def update(
         learner: Learner, batch: Batch, contexts: PyTree, key: Key, env_steps: Array
-    ) -> tuple[Learner, Stored, Metrics]:
+    ) -> tuple[Learner, PyTree, Metrics]:
         gradient, (latent, state, return_scale, metrics) = jax.grad(loss_fn, has_aux=True)(
             learner.params, learner, batch, contexts, key, env_steps
         )
@@ -132,7 +131,7 @@ def make_update_in_turn(agent: Agent, config: Config, optimizers: optim.Adams) -
 
     def update(
         learner: Learner, batch: Batch, contexts: PyTree, key: Key, env_steps: Array
-    ) -> tuple[Learner, Stored, Metrics]:
+    ) -> tuple[Learner, PyTree, Metrics]:
         key_model, key_behaviour = jax.random.split(key)
         before, opt_state, slow_critic = learner.params, learner.opt_state, learner.slow_critic
         step = warmup_step(config, learner, env_steps)

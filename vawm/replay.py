@@ -2,9 +2,9 @@
 
 Every leaf is `[N, C, ...]`: N streams, one per environment, of C steps each. A sample is
 a run of consecutive steps of one stream, free to cross episode ends, never the write
-head. Beside each step lies the latent that the agent inferred there, if its world model has a
-use for it; a sample starts from the one at its first step, and the learner writes the latents
-that it infers back. In the place of latents that nobody needs is `()`.
+head. Beside each step lies what the world model wants to remember of it, such as the latent
+inferred there (`WorldModel.memory`), or `()`; a sample starts from that at its first step, and
+the learner writes back what it infers.
 """
 
 from __future__ import annotations
@@ -15,15 +15,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vawm.types import Array, Batch, EnvSpec, Key, Latent, Trajectory
-
-Stored = Latent | tuple[()]
-"""Latents, or nothing."""
+from vawm.types import Array, Batch, EnvSpec, Key, PyTree, Trajectory
 
 
 class Replay(NamedTuple):
     trajectory: Trajectory  # [N, C, ...]
-    latent: Stored  # deter [N, C, D]; stoch as class indices [N, C, S] uint8
+    latent: PyTree  # [N, C, ...] what is remembered beside a step
     head: Array  # [] int32, where the next step is written
     size: Array  # [] int32, steps held in each stream
 
@@ -52,7 +49,7 @@ def capacity_per_env(
     return max(1, min(capacity // spec.num_envs, collected))
 
 
-def init(example: Trajectory, latent: Stored, *, capacity: int) -> Replay:
+def init(example: Trajectory, latent: PyTree, *, capacity: int) -> Replay:
     """An empty buffer for steps like `example` and `latent`, each `[N, ...]`."""
 
     def empty(x):
@@ -60,29 +57,13 @@ def init(example: Trajectory, latent: Stored, *, capacity: int) -> Replay:
 
     return Replay(
         trajectory=jax.tree.map(empty, example),
-        latent=jax.tree.map(empty, pack(latent)),
+        latent=jax.tree.map(empty, latent),
         head=jnp.zeros((), jnp.int32),
         size=jnp.zeros((), jnp.int32),
     )
 
 
-def pack(latent: Stored) -> Stored:
-    """One-hot classes as their indices: exact, and a byte instead of K floats."""
-    if not isinstance(latent, Latent):
-        return ()
-    return latent._replace(stoch=jnp.argmax(latent.stoch, -1).astype(jnp.uint8))
-
-
-def unpack(latent: Stored, classes: int) -> Stored:
-    """Inverse of `pack`."""
-    if not isinstance(latent, Latent):
-        return ()
-    return latent._replace(
-        stoch=jax.nn.one_hot(latent.stoch, classes, dtype=latent.deter.dtype)
-    )
-
-
-def add(replay: Replay, trajectory: Trajectory, latent: Stored) -> Replay:
+def add(replay: Replay, trajectory: Trajectory, latent: PyTree) -> Replay:
     """Append K steps `[N, K, ...]` to every stream; the oldest are overwritten."""
     capacity = replay.trajectory.reward.shape[1]
     length = trajectory.reward.shape[1]
@@ -95,7 +76,7 @@ def add(replay: Replay, trajectory: Trajectory, latent: Stored) -> Replay:
 
     return Replay(
         trajectory=jax.tree.map(write, replay.trajectory, trajectory),
-        latent=jax.tree.map(write, replay.latent, pack(latent)),
+        latent=jax.tree.map(write, replay.latent, latent),
         head=(replay.head + length) % capacity,
         size=jnp.minimum(replay.size + length, capacity),
     )
@@ -138,21 +119,21 @@ def draw_on_host(
     return Positions(env.astype(np.int32), time.astype(np.int32))
 
 
-def read(replay: Replay, positions: Positions, *, classes: int) -> Batch:
-    """What lies at `positions`: `[B, L, ...]`, and the stored latents of their first steps."""
+def read(replay: Replay, positions: Positions) -> Batch:
+    """What lies at `positions`: `[B, L, ...]`, and what is kept beside their first steps."""
     env, time = positions
     trajectory = jax.tree.map(lambda x: x[env[:, None], time], replay.trajectory)
     context = jax.tree.map(lambda x: x[env, time[:, 0]], replay.latent)
     # An episode that a reset cut short has no last step of its own.
     abandoned = jnp.pad(trajectory.is_first[:, 1:], ((0, 0), (0, 1)))
     trajectory = trajectory._replace(is_last=trajectory.is_last | abandoned)
-    return Batch(trajectory, unpack(context, classes))
+    return Batch(trajectory, context)
 
 
-def write_back(replay: Replay, positions: Positions, latent: Stored) -> Replay:
-    """Replace the stored latents at `positions` by newer ones, `[B, L, ...]`."""
+def write_back(replay: Replay, positions: Positions, latent: PyTree) -> Replay:
+    """Replace what is kept at `positions` by something newer, `[B, L, ...]`."""
 
     def write(buffer, x):
         return buffer.at[positions.env[:, None], positions.time].set(x.astype(buffer.dtype))
 
-    return replay._replace(latent=jax.tree.map(write, replay.latent, pack(latent)))
+    return replay._replace(latent=jax.tree.map(write, replay.latent, latent))

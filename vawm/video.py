@@ -48,10 +48,10 @@ def make(program: Program, config: Config) -> Callable[[TrainState], list[Video]
     """
     if not config.video.every:
         return None
-    choices, classes = config.video, config.world_model.classes
+    choices = config.video
     on_host = config.replay.images == "host"
     predict = jax.jit(make_open_loop(program.agent, context=choices.context))
-    look_up = jax.jit(lambda buffer, at: replay.read(buffer, at, classes=classes))
+    look_up = jax.jit(lambda buffer, at: replay.read(buffer, at))
 
     def look(state: TrainState, positions: Positions) -> Batch:
         images = image_store.read(state.images, positions) if on_host else ()

@@ -21,7 +21,8 @@ class WorldModel(NamedTuple):
       init: `(key) -> (params, state)`.
       initial: `(batch_size) -> carry`, what is remembered before the first observation.
       memory: `(carry) -> PyTree`, what replay keeps beside every step, from which `explain`
-        begins a sequence; `()` for nothing. Also of the latents of an `Inference`.
+        and `follow` begin a sequence: the context of a `Batch`; `()` for nothing. Also of the
+        latents of an `Inference`.
       filter: `(params, state, key, carry, obs, prev_action, is_first) -> (carry, Latent)`, one
         step of acting, `[N, ...]`: the latent that the policy reads. `prev_action` led to
         `obs`; where `is_first` it is of no episode.

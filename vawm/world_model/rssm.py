@@ -23,6 +23,7 @@ from vawm.types import (
     flat_stoch,
 )
 from vawm.world_model.heads import make_heads
+from vawm.world_model.packing import pack, unpack
 from vawm.world_model.protocol import Imagination, WorldModel
 
 
@@ -130,7 +131,8 @@ def rssm(
         steps = batch.trajectory
         obs, is_first = jax.tree.map(lambda x: x[:, 1:], (steps.obs, steps.is_first))
         prev_action = steps.action[:, :-1]
-        return observe(params, state, key, batch.context, obs, prev_action, is_first)
+        context = unpack(batch.context, config.classes)
+        return observe(params, state, key, context, obs, prev_action, is_first)
 
     def filter_step(
         params: PyTree,
@@ -194,7 +196,7 @@ def rssm(
     return WorldModel(
         init=init,
         initial=functools.partial(blank, config, dtype=dtype),
-        memory=lambda latent: latent,
+        memory=pack,
         filter=filter_step,
         explain=explain,
         starts=starts,

@@ -1,0 +1,20 @@
+"""How latents lie in replay: classes of one-hot z as bytes."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from vawm.types import Latent
+
+
+def pack(latent: Latent) -> Latent:
+    """One-hot classes `[..., S, K]` as their indices `[..., S]`: exact, a byte for K floats."""
+    return latent._replace(stoch=jnp.argmax(latent.stoch, -1).astype(jnp.uint8))
+
+
+def unpack(latent: Latent, classes: int) -> Latent:
+    """Inverse of `pack`, in the dtype of h."""
+    return latent._replace(
+        stoch=jax.nn.one_hot(latent.stoch, classes, dtype=latent.deter.dtype)
+    )
