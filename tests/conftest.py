@@ -3,6 +3,7 @@
 import os
 
 import chex
+import hypothesis
 import jax
 import pytest
 
@@ -13,6 +14,9 @@ os.environ.setdefault("MUJOCO_GL", "disable")  # dm_control is asked for physics
 cache.enable()
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_debug_key_reuse", True)
+# The same examples in every run; the first of each test compiles, whatever the time.
+hypothesis.settings.register_profile("vawm", derandomize=True, deadline=None, max_examples=50)
+hypothesis.settings.load_profile("vawm")
 
 
 def pytest_configure(config):

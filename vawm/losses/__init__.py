@@ -9,6 +9,11 @@ caller's.
     value_alignment_weight                                    Eq. 5   its adaptive weight
     critic_loss                                               Eq. 7   towards lambda-returns
     actor_loss, discount_weights                              Eq. 8   policy gradient
+
+The family of value-aware losses, from the papers that their docstrings name:
+
+    vagram_loss, vagram_taylor_loss                  weighted by the gradient of the value
+    vagram_second_order_loss, vagram_joint_loss      and by its Hessian
 """
 
 from vawm.losses.behaviour import actor_loss, critic_loss, discount_weights
@@ -21,6 +26,12 @@ from vawm.losses.likelihood import (
     image_mse,
     prediction_loss,
     symlog_mse,
+)
+from vawm.losses.vagram import (
+    vagram_joint_loss,
+    vagram_loss,
+    vagram_second_order_loss,
+    vagram_taylor_loss,
 )
 from vawm.losses.value_alignment import value_alignment_loss, value_alignment_weight
 
@@ -36,6 +47,10 @@ __all__ = [
     "image_mse",
     "prediction_loss",
     "symlog_mse",
+    "vagram_joint_loss",
+    "vagram_loss",
+    "vagram_second_order_loss",
+    "vagram_taylor_loss",
     "value_alignment_loss",
     "value_alignment_weight",
 ]
