@@ -30,6 +30,7 @@ LAYERS = {
     "actor_critic": {"config", "distributions", "errors", "nets", "transforms", "types"},
     "imagination": {"distributions", "types", "world_model"},
     "agent": {"actor_critic", "config", "types", "world_model"},
+    "value_gradient": {"agent", "config", "distributions", "losses", "transforms", "types"},
     "objective": {
         "agent",
         "config",
@@ -38,6 +39,7 @@ LAYERS = {
         "returns",
         "transforms",
         "types",
+        "value_gradient",
     },
     "open_loop": {"agent", "types"},
     "collector": {"agent", "config", "envs", "replay", "types"},

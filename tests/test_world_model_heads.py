@@ -54,7 +54,7 @@ def test_square_images_of_several_sizes_are_read_and_predicted(size):
     tokens = heads.encode(params, state, random_obs(image(size)))
     assert tokens.shape == (*LEADING, heads.token_size)
     assert heads.token_size == (size // 16) ** 2 * 4 * CONFIG.depth
-    predicted = heads.predict(params, state, latent()).obs
+    predicted = heads.decode(params, state, latent())
     assert predicted.shape == (*LEADING, size, size, 3)
     assert ((predicted > 0) & (predicted < 1)).all()
 
@@ -78,7 +78,7 @@ def test_images_and_vectors_are_mixed_and_each_is_predicted_at_its_place():
     obs = random_obs(MIXED)
     tokens = heads.encode(params, state, obs)
     assert heads.token_size == CONFIG.units + 3 * 3 * 4 * CONFIG.depth
-    predicted = heads.predict(params, state, latent()).obs
+    predicted = heads.decode(params, state, latent())
     assert {k: x.shape for k, x in predicted.items()} == {k: x.shape for k, x in obs.items()}
     read = {"joints": slice(None, CONFIG.units), "top": slice(CONFIG.units, None)}
     for name, changed in read.items():

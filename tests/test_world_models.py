@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import tiny
 import tiny_storm
+import tiny_vagram
 from test_nets import noisy
 
 from vawm import objective
@@ -21,6 +22,7 @@ BATCH, LENGTH = 3, 6
 VECTOR, PIXELS = vector(4), image(48)
 MODELS = {
     "rssm": (tiny.CONFIG, VECTOR),
+    "vagram": (tiny_vagram.CONFIG, VECTOR),
     "storm": (tiny_storm.CONFIG, VECTOR),
     "storm_clear": (
         tiny_storm.config(world_model=tiny_storm.model(clear_context=True)),
@@ -28,7 +30,8 @@ MODELS = {
     ),
     "storm_pixels": (tiny_storm.config(world_model=tiny_storm.model(depth=4)), PIXELS),
 }
-FORGETTING = ("rssm", "storm_clear")  # what was before an episode does not matter in it
+RECURRENT = "rssm", "vagram"
+FORGETTING = (*RECURRENT, "storm_clear")  # what was before an episode does not matter in it
 
 
 @functools.cache
@@ -51,7 +54,7 @@ def variables(name):
     if jax.tree.leaves(state):
         _, moved = explain(name)(params, state, 3, experience(name, seed=3))
         state = jax.tree.map(lambda old, new: old + 10 * (new - old), state, moved)
-    net = params.world_model["rssm" if name == "rssm" else "storm"]
+    net = params.world_model["rssm" if name in RECURRENT else "storm"]
     out = net["posterior_out"]
     net["posterior_out"] = out | {"kernel": 100 * out["kernel"]}
     return params, state
@@ -62,9 +65,9 @@ def blind(name):
     """As `variables`, but z is the same whatever is seen and predicted, for every noise."""
     params, state = variables(name)
     world_model = jax.tree.map(lambda x: x, params.world_model)
-    net = world_model["rssm" if name == "rssm" else "storm"]
-    out = {"rssm": ("posterior_out", ("prior_net", "heads_0"))}
-    for path in out.get(name, ("posterior_out", "prior_out")):
+    net = world_model["rssm" if name in RECURRENT else "storm"]
+    prior = ("prior_net", "heads_0") if name in RECURRENT else "prior_out"
+    for path in ("posterior_out", prior):
         path = (path,) if isinstance(path, str) else path
         layer = functools.reduce(lambda node, key: node[key], path, net)
         layer["kernel"] = jnp.zeros_like(layer["kernel"])
@@ -258,9 +261,11 @@ def test_acting_step_by_step_sees_what_a_sequence_sees(name):
             params, state, seed, carry, obs, action, steps.is_first[:, t]
         )
         action = steps.action[:, t]
-        if name == "rssm" and t == 0:
+        if name in RECURRENT and t == 0:
             # A sequence of replay begins with the latent stored there, not with its first step.
-            whole, _ = follow(name)(params, state, seed, batch._replace(context=latent))
+            whole, _ = follow(name)(
+                params, state, seed, batch._replace(context=agent.world_model.memory(latent))
+            )
         if t:
             close(latent.deter, whole.deter[:, t - 1])
 
@@ -287,7 +292,7 @@ def test_targets_are_what_arrived_where_the_predictions_are(name):
     chex.assert_equal_shape([predictions.cont, targets.reward, targets.is_terminal])
     chex.assert_trees_all_equal_shapes(predictions.obs, targets.obs)
     np.testing.assert_array_equal(targets.reward, batch.trajectory.reward[:, 1:])
-    at = slice(1, None) if name == "rssm" else slice(0, -1)
+    at = slice(1, None) if name in RECURRENT else slice(0, -1)
     np.testing.assert_array_equal(targets.obs, batch.trajectory.obs[:, at])
 
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from vawm.actor_critic import Actor, Critic, make_actor, make_critic
-from vawm.config import Config, RSSMConfig, StormConfig
+from vawm.config import Config, RSSMConfig, StormConfig, VagramConfig
 from vawm.types import Array, EnvSpec, Key, Params, PyTree, TimeStep
 from vawm.world_model.protocol import WorldModel
 from vawm.world_model.rssm import rssm
@@ -110,7 +110,8 @@ def make_agent(config: Config, spec: EnvSpec) -> Agent:
     if isinstance(model, StormConfig):
         world_model = storm(model, spec, dtype=dtype, noise=noise)
     elif isinstance(model, RSSMConfig):
-        world_model = rssm(model, spec, dtype=dtype, noise=noise)
+        deterministic = isinstance(model, VagramConfig)
+        world_model = rssm(model, spec, dtype=dtype, noise=noise, deterministic=deterministic)
     else:
         raise TypeError(f"no world model for {type(model).__name__}")
     return Agent(

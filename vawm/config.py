@@ -76,6 +76,31 @@ class RSSMConfig(WorldModelConfig):
     decoder_layers: int = 3
     reward_layers: int = 1
     continue_layers: int = 1
+    reconstruction_gradient: bool = True
+    """whether reconstruction shapes the latents; else the decoder only shows what they hold"""
+
+
+@dataclass(frozen=True)
+class VagramConfig(RSSMConfig):
+    """A deterministic RSSM that learns what the value depends on, in the place of likelihood.
+
+    z is its categoricals' probabilities. The prior is trained by VaGraM; latents by that, by
+    rewards, continuation and the replay value loss.
+    """
+
+    dynamics_scale: float = 0.0
+    """of the KL, which VaGraM replaces"""
+    representation_scale: float = 0.0
+    """of the KL, which VaGraM replaces"""
+    reconstruction_gradient: bool = False
+    value_gradient_scale: float = 1.0
+    """of VaGraM's loss"""
+    value_gradient_form: Literal["diagonal", "taylor", "second_order"] = "diagonal"
+    """sum_j (dV/dz_j e_j)^2, the official one; (dV/dz . e)^2; or the latter with the Hessian"""
+    value_gradient_critic: Literal["online", "slow", "both"] = "both"
+    """whose gradient; both: the mean of two losses, as the official code has it"""
+    value_gradient_unit: Literal["symlog", "raw"] = "symlog"
+    """of V: its symlog, whose gradients do not grow with the scale of rewards; or V"""
 
 
 @dataclass(frozen=True)
@@ -361,6 +386,7 @@ class AgentConfigs(NamedTuple):
 AGENT_CONFIGS = {
     "dreamerv3": AgentConfigs(RSSMConfig, LaPropConfig),
     "storm": AgentConfigs(StormConfig, AdamConfig),
+    "vagram": AgentConfigs(VagramConfig, LaPropConfig),
 }
 """Agent -> what can be chosen of it."""
 
@@ -372,8 +398,9 @@ class Config:
     suite: Literal["dmc_proprio", "dmc_vision", "atari100k", "gymnasium"] = "dmc_proprio"
     """where the task is from"""
     task: str = "cartpole_swingup"
-    agent: Literal["dreamerv3", "storm"] = "dreamerv3"
-    """which world model imagines: a recurrent one, or a transformer"""
+    agent: Literal["dreamerv3", "storm", "vagram"] = "dreamerv3"
+    """which world model imagines: a recurrent one, a transformer, or a recurrent one without
+    noise or likelihood"""
     preset: str = "paper"
     """where the other numbers come from: an entry of `presets.PRESETS`, or custom"""
     size: str = "12m"
@@ -430,20 +457,23 @@ class StormSize(NamedTuple):
     depth: int
 
 
+RSSM_SIZES = {
+    "1m": RSSMSize(deter=512, hidden=64, classes=4, units=64, depth=4),
+    "12m": RSSMSize(deter=2048, hidden=256, classes=16, units=256, depth=16),
+    "25m": RSSMSize(deter=3072, hidden=384, classes=24, units=384, depth=24),
+    "50m": RSSMSize(deter=4096, hidden=512, classes=32, units=512, depth=32),
+    "100m": RSSMSize(deter=6144, hidden=768, classes=48, units=768, depth=48),
+    "200m": RSSMSize(deter=8192, hidden=1024, classes=64, units=1024, depth=64),
+    "400m": RSSMSize(deter=12288, hidden=1536, classes=96, units=1536, depth=96),
+}
+
 SIZES: dict[str, dict[str, RSSMSize] | dict[str, StormSize]] = {
-    "dreamerv3": {
-        "1m": RSSMSize(deter=512, hidden=64, classes=4, units=64, depth=4),
-        "12m": RSSMSize(deter=2048, hidden=256, classes=16, units=256, depth=16),
-        "25m": RSSMSize(deter=3072, hidden=384, classes=24, units=384, depth=24),
-        "50m": RSSMSize(deter=4096, hidden=512, classes=32, units=512, depth=32),
-        "100m": RSSMSize(deter=6144, hidden=768, classes=48, units=768, depth=48),
-        "200m": RSSMSize(deter=8192, hidden=1024, classes=64, units=1024, depth=64),
-        "400m": RSSMSize(deter=12288, hidden=1536, classes=96, units=1536, depth=96),
-    },
+    "dreamerv3": RSSM_SIZES,
     "storm": {
         "1m": StormSize(deter=128, feedforward=256, heads=4, classes=8, units=128, depth=8),
         "16m": StormSize(deter=512, feedforward=1024, heads=8, classes=32, units=512, depth=32),
     },
+    "vagram": RSSM_SIZES,
 }
 """Agent -> name -> widths. STORM's official size is 16m, named after its world model."""
 

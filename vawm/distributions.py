@@ -20,6 +20,7 @@ __all__ = [
     "Policy",
     "bounded_normal",
     "one_hot_categorical",
+    "probabilities",
     "sample_index",
     "sample_one_hot",
     "unimix_logits",
@@ -43,7 +44,7 @@ def sample_index(logits: Array, uniform: Array, *, unimix: float) -> Array:
     Returns:
       `[...]` int32 in [0, K).
     """
-    return _invert(_probs(logits, unimix), uniform)
+    return _invert(probabilities(logits, unimix=unimix), uniform)
 
 
 def sample_one_hot(logits: Array, uniform: Array, *, unimix: float) -> Array:
@@ -59,10 +60,16 @@ def sample_one_hot(logits: Array, uniform: Array, *, unimix: float) -> Array:
     Returns:
       `[..., K]` float32, exactly 0 and 1. The gradient to the logits is that of p.
     """
-    probs = _probs(logits, unimix)
+    probs = probabilities(logits, unimix=unimix)
     one_hot = jax.nn.one_hot(_invert(probs, uniform), logits.shape[-1])
     # p - sg(p) is exactly 0: added first, it leaves no rounding in the sample.
     return one_hot + (probs - jax.lax.stop_gradient(probs))
+
+
+def probabilities(logits: Array, *, unimix: float) -> Array:
+    """(1 - u) * softmax(logits) + u / K over the last axis, float32."""
+    probs = jax.nn.softmax(logits.astype(jnp.float32))
+    return (1 - unimix) * probs + unimix / logits.shape[-1]
 
 
 class Policy(NamedTuple):
@@ -109,11 +116,6 @@ def one_hot_categorical(logits: Array, *, unimix: float) -> Policy:
         entropy=categorical.entropy,
         mode=categorical.mode,
     )
-
-
-def _probs(logits: Array, unimix: float) -> Array:
-    probs = jax.nn.softmax(logits.astype(jnp.float32))
-    return (1 - unimix) * probs + unimix / logits.shape[-1]
 
 
 def _invert(probs: Array, uniform: Array) -> Array:

@@ -1,6 +1,7 @@
 """The one loss that an update differentiates, in the order in which the data flows.
 
     1 explain the batch   2 maximum likelihood   3 value alignment      make_world_model_loss
+      (VaGraM in the place of the KL: make_value_gradient_loss)
     4 imagine   5 returns and their scale                                       make_foresight
     6 critic and actor                                                     make_behaviour_loss
 
@@ -20,7 +21,7 @@ import jax.numpy as jnp
 
 from vawm import losses, returns, transforms
 from vawm.agent import Agent
-from vawm.config import Config
+from vawm.config import Config, VagramConfig
 from vawm.imagination import imagine
 from vawm.types import (
     Array,
@@ -33,6 +34,7 @@ from vawm.types import (
     PyTree,
     Trajectory,
 )
+from vawm.value_gradient import make_value_gradient_loss
 
 
 def total(parts: Metrics) -> Array:
@@ -97,6 +99,9 @@ def make_world_model_loss(agent: Agent, config: Config):
     """
     model = config.world_model
     value_alignment = make_value_alignment(agent, config)
+    vagram = None
+    if isinstance(model, VagramConfig):
+        vagram = make_value_gradient_loss(agent, model)
     reward_code = transforms.make_two_hot(model.bins, model.bin_spacing)
     discount = 1.0 if model.continue_target == "plain" else discount_of(config)
     of_batch = model.free_nats_of == "batch"
@@ -142,6 +147,8 @@ def make_world_model_loss(agent: Agent, config: Config):
             "loss/continue": prediction.cont,
             "loss/dynamics": dynamics,
         }
+        if vagram:
+            parts["loss/value_gradient"] = vagram(params.critic, slow_critic, inference)
         parts = {name: jnp.mean(part) for name, part in parts.items()}
         loss_var = {"loss/value_alignment": jnp.mean(aligned.weight * aligned.loss)}
         if config.value_alignment.weight != "off":

@@ -6,6 +6,7 @@ import dataclasses
 from typing import Any
 
 from vawm.config import (
+    SIZES,
     ActorConfig,
     AdamConfig,
     AtariConfig,
@@ -16,7 +17,9 @@ from vawm.config import (
     ImaginationConfig,
     LaPropConfig,
     ReplayConfig,
+    RSSMConfig,
     StormConfig,
+    VagramConfig,
     ValueAlignmentConfig,
     VideoConfig,
     VisionConfig,
@@ -192,7 +195,19 @@ def small_storm(like: Config) -> Config:
     return dataclasses.replace(like, **{name: getattr(STORM_QUICK, name) for name in taken})
 
 
-PRESETS = {
+def vagram(like: Config) -> Config:
+    """A deterministic world model and VaGraM, in the run that `like` is for DreamerV3."""
+    assert isinstance(like.world_model, RSSMConfig)
+    widths = SIZES["vagram"][like.size]._asdict()
+    return dataclasses.replace(
+        like,
+        agent="vagram",
+        world_model=VagramConfig(**widths),
+        value_alignment=dataclasses.replace(like.value_alignment, weight="off"),
+    )
+
+
+PRESETS: dict[str, dict[str, dict[str, Config]]] = {
     "dreamerv3": {
         "dmc_proprio": {"quick": QUICK, "paper": PAPER},
         "dmc_vision": {"quick": VISION_QUICK, "paper": VISION_PAPER},
@@ -216,6 +231,11 @@ PRESETS = {
     },
 }
 """Agent -> suite -> name -> config."""
+
+PRESETS["vagram"] = {
+    suite: {name: vagram(config) for name, config in named.items()}
+    for suite, named in PRESETS["dreamerv3"].items()
+}
 
 
 def of(config: Config) -> dict[str, Config]:

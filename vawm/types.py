@@ -99,7 +99,7 @@ class Latent(NamedTuple):
     """s_t = (h_t, z_t)."""
 
     deter: Array  # [..., D]
-    stoch: Array  # [..., S, K] one-hot, straight-through
+    stoch: Array  # [..., S, K] one-hot, straight-through; or probabilities, if deterministic
 
 
 def flat_stoch(stoch: Array) -> Array:

@@ -43,6 +43,7 @@ RULES: dict[str, Rule] = {
     "world_model.reconstruction_scale": NOT_NEGATIVE,
     "world_model.dynamics_scale": NOT_NEGATIVE,
     "world_model.representation_scale": NOT_NEGATIVE,
+    "world_model.value_gradient_scale": NOT_NEGATIVE,
     "world_model.dropout": BELOW_ONE,
     "actor.unimix": BELOW_ONE,
     "actor.scale": NOT_NEGATIVE,

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from vawm import nets
 from vawm.config import RSSMConfig
-from vawm.types import Array, EnvSpec, Key, Latent, Predictions, PyTree, flat_stoch
+from vawm.types import Array, EnvSpec, Key, Latent, PyTree, flat_stoch
 from vawm.world_model import codecs
 from vawm.world_model.codecs import Codec, Codecs, join_pixels, split_pixels
 
@@ -18,11 +18,20 @@ Network = nets.MLP | nets.ReluMLP
 
 
 class Heads(NamedTuple):
-    """Pure functions; `token_size` is the width of what `encode` returns."""
+    """Pure functions.
+
+    Attributes:
+      init: `(key) -> (params, state)`.
+      encode: `(params, state, obs) -> tokens`.
+      decode: `(params, state, latent) -> obs`.
+      outcome: `(params, latent) -> (reward logits [..., bins], continue logit [...])`.
+      token_size: width of the tokens.
+    """
 
     init: Callable[[Key], tuple[PyTree, PyTree]]
     encode: Callable[[PyTree, PyTree, PyTree], Array]
-    predict: Callable[[PyTree, PyTree, Latent], Predictions]
+    decode: Callable[[PyTree, PyTree, Latent], PyTree]
+    outcome: Callable[[PyTree, Latent], tuple[Array, Array]]
     token_size: int
 
 
@@ -49,7 +58,7 @@ def make_heads(config: RSSMConfig, spec: EnvSpec, dtype: jnp.dtype) -> Heads:
     reward = mlp(config.reward_layers, config.bins, 0.0)
     cont = mlp(config.continue_layers, 1, 1.0)
 
-    outcome = make_outcome(reward, cont)
+    read = make_outcome(reward, cont)
 
     def init(key: Key) -> tuple[PyTree, PyTree]:
         return init_heads(key, codec, reward, cont, jnp.zeros((1, features)))
@@ -57,12 +66,14 @@ def make_heads(config: RSSMConfig, spec: EnvSpec, dtype: jnp.dtype) -> Heads:
     def encode(params: PyTree, state: PyTree, obs: PyTree) -> Array:
         return codec.encode(params["encoder"], state["encoder"], obs, train=False)[0]
 
-    def predict(params: PyTree, state: PyTree, latent: Latent) -> Predictions:
+    def decode(params: PyTree, state: PyTree, latent: Latent) -> PyTree:
         feature = latent.deter, flat_stoch(latent.stoch)
-        obs, _ = codec.decode(params["decoder"], state["decoder"], feature, train=False)
-        return Predictions(obs, *outcome(params, *feature))
+        return codec.decode(params["decoder"], state["decoder"], feature, train=False)[0]
 
-    return Heads(init, encode, predict, codec.token_size)
+    def outcome(params: PyTree, latent: Latent) -> tuple[Array, Array]:
+        return read(params, latent.deter, flat_stoch(latent.stoch))
+
+    return Heads(init, encode, decode, outcome, codec.token_size)
 
 
 def init_heads(

@@ -18,6 +18,7 @@ from vawm.types import (
     Inference,
     Key,
     Latent,
+    Predictions,
     PyTree,
     Targets,
     flat_stoch,
@@ -56,12 +57,14 @@ def rssm(
     *,
     dtype: jnp.dtype = jnp.float32,
     noise: Literal["independent", "shared"] = "independent",
+    deterministic: bool = False,
 ) -> WorldModel:
     """DreamerV3's world model with block GRU.
 
         h_t = f(h_{t-1}, z_{t-1}, a_{t-1}),  z_t ~ q(z | h_t, o_t),  z~_t ~ p(z | h_t)
 
-    It remembers the `Latent` s_{t-1}, which replay keeps beside every step. What needs no
+    Or, deterministic, with the probabilities of q and p in the place of samples. It remembers
+    the `Latent` s_{t-1}, which replay keeps beside every step. What needs no
     recurrence (the encoder, what the action and the observation add to their layers, the
     prior) is computed for all time steps at once; the scan holds only the rest. Nothing is
     carried from update to update (the state has no arrays), and nothing differs between
@@ -73,6 +76,7 @@ def rssm(
       dtype: of products; parameters, logits and norms stay float32.
       noise: whether z~ is sampled with its own noise or with the noise of z ("shared":
         equal distributions then give equal samples).
+      deterministic: whether z and z~ are probabilities, and no key matters.
     """
     heads = make_heads(config, spec, dtype)
     net = network(config, actions=spec.action_size, tokens=heads.token_size, dtype=dtype)
@@ -81,7 +85,15 @@ def rssm(
         return net.apply({"params": params["rssm"]}, *args, method=method)
 
     def sample(logits: Array, uniform: Array) -> Array:
+        if deterministic:
+            return distributions.probabilities(logits, unimix=config.unimix).astype(dtype)
         return distributions.sample_one_hot(logits, uniform, unimix=config.unimix).astype(dtype)
+
+    def remember(latent: Latent) -> Latent:
+        return latent if deterministic else pack(latent)
+
+    def recall(context: Latent) -> Latent:
+        return context if deterministic else unpack(context, config.classes)
 
     def init(key: Key) -> tuple[PyTree, PyTree]:
         key_rssm, key_heads = jax.random.split(key)
@@ -131,7 +143,7 @@ def rssm(
         steps = batch.trajectory
         obs, is_first = jax.tree.map(lambda x: x[:, 1:], (steps.obs, steps.is_first))
         prev_action = steps.action[:, :-1]
-        context = unpack(batch.context, config.classes)
+        context = recall(batch.context)
         return observe(params, state, key, context, obs, prev_action, is_first)
 
     def filter_step(
@@ -154,7 +166,12 @@ def rssm(
         """Everything at steps 1..T."""
         inference = observe_batch(params, state, key, batch)
         steps = jax.tree.map(lambda x: x[:, 1:], batch.trajectory)
-        predictions = heads.predict(params, state, inference.latent)
+        shown = inference.latent
+        if not config.reconstruction_gradient:
+            shown = jax.lax.stop_gradient(shown)
+        predictions = Predictions(
+            heads.decode(params, state, shown), *heads.outcome(params, inference.latent)
+        )
         targets = Targets(steps.obs, steps.reward, steps.is_terminal)
         return Explanation(inference, predictions, targets), state
 
@@ -193,14 +210,18 @@ def rssm(
         latent = Latent(deter, sample(logits, uniform))
         return (blocks, latent), latent
 
+    def predict(params: PyTree, state: PyTree, latent: Latent) -> Predictions:
+        obs = heads.decode(params, state, latent)
+        return Predictions(obs, *heads.outcome(params, latent))
+
     return WorldModel(
         init=init,
         initial=functools.partial(blank, config, dtype=dtype),
-        memory=pack,
+        memory=remember,
         filter=filter_step,
         explain=explain,
         starts=starts,
         follow=follow,
         imagine=imagine,
-        predict=heads.predict,
+        predict=predict,
     )

@@ -1,0 +1,40 @@
+"""The deterministic world model in the same training step: probabilities in replay."""
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tiny
+import tiny_vagram
+
+from vawm import train
+from vawm.agent import make_agent
+
+CONFIG = tiny_vagram.CONFIG
+
+
+def test_it_learns_and_replay_remembers_probabilities():
+    env = tiny.env()
+    agent = make_agent(CONFIG, env.spec)
+    step = chex.assert_max_traces(train.make_train_step(env, agent, CONFIG), n=1)
+    run = jax.jit(step, donate_argnums=0)
+    first = jax.jit(lambda key: train.init(env, agent, CONFIG, key))(jax.random.key(0))
+    state, lines = jax.tree.map(jnp.copy, first), []
+    for _ in range(8):
+        state, metrics = run(state)
+        lines.append({name: float(value) for name, value in metrics.items()})
+    assert lines[-1]["updates"] > 2
+    assert all(np.isfinite(value) for value in lines[-1].values())
+    assert lines[-1]["loss/value_gradient"] > 0
+    assert lines[-1]["loss/dynamics"] == lines[-1]["loss/value_alignment"] == 0.0
+    for part in ("rssm", "encoder", "decoder", "reward", "cont"):
+        moved = jax.tree.map(
+            lambda a, b: float(abs(a - b).max()),
+            first.learner.params.world_model[part],
+            state.learner.params.world_model[part],
+        )
+        assert max(jax.tree.leaves(moved)) > 0, part
+    kept = state.replay.latent.stoch[:, : int(state.replay.size)]
+    assert kept.dtype == jnp.float32
+    np.testing.assert_allclose(kept.sum(-1), 1.0, rtol=1e-5)
+    assert ((kept > 0) & (kept < 1)).all()

@@ -1,0 +1,168 @@
+"""VaGraM on latents: against loops, by hand, and what learns from it."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import tiny
+import tiny_vagram
+from test_nets import noisy
+from test_objective import batch, norm
+
+from vawm import losses, objective
+from vawm.actor_critic import Critic
+from vawm.agent import make_agent
+from vawm.transforms import TwoHot
+from vawm.types import Inference, Latent
+from vawm.value_gradient import make_value_gradient_loss
+
+CONFIG, SPEC = tiny_vagram.CONFIG, tiny.env().spec
+SHAPE = 2, 3  # B, T
+AGENT = make_agent(CONFIG, SPEC)
+
+# V = p * (sum_j w_j z_j)^2 * mean(h): two numbers are enough to compute its gradient by hand.
+WEIGHT = np.linspace(-1.0, 2.0, 16)
+SIMPLE = AGENT._replace(
+    critic=Critic(
+        init=lambda key: jnp.float32(1),
+        logits=lambda p, latent: (
+            p
+            * jnp.square(latent.stoch.reshape(*latent.stoch.shape[:-2], 16) @ WEIGHT)
+            * latent.deter.mean(-1)
+        )[..., None],
+        code=TwoHot(jnp.zeros(1), lambda y: y, lambda logits: logits[..., 0]),
+    )
+)
+
+
+def model(**changes):
+    return dataclasses.replace(CONFIG.world_model, **changes)
+
+
+def inference():
+    keys = jax.random.split(jax.random.key(0), 3)
+    deter = 1.0 + jax.random.uniform(keys[0], (*SHAPE, 32))
+    post, prior = (2 * jax.random.normal(key, (*SHAPE, 4, 4)) for key in keys[1:])
+    samples = (Latent(deter, jax.nn.softmax(logits)) for logits in (post, prior))
+    return Inference(*samples, post, prior)
+
+
+def slow_loss(critic, unit, scale):
+    """Diagonal form, state by state, from softmax and the derivative of the square."""
+    inferred = jax.tree.map(lambda x: np.asarray(x, np.float64), inference())
+    loss = np.zeros(SHAPE)
+    for at in np.ndindex(SHAPE):
+        z, guess = (
+            0.99 * np.exp(x[at]) / np.exp(x[at]).sum(-1, keepdims=True) + 0.01 / 4
+            for x in (inferred.post_logits, inferred.prior_logits)
+        )
+        along, h = z.reshape(16) @ WEIGHT, inferred.latent.deter[at].mean()
+        for j, (a, b) in enumerate(zip(guess.reshape(16), z.reshape(16), strict=True)):
+            gradient = critic * 2 * along * WEIGHT[j] * h
+            if unit == "symlog":
+                gradient /= 1 + abs(critic * along**2 * h)
+            loss[at] += scale * (gradient * (a - b)) ** 2
+    return loss
+
+
+@pytest.mark.parametrize("unit", ["symlog", "raw"])
+def test_the_loss_equals_a_loop_over_the_entries_of_z(unit):
+    choices = model(value_gradient_unit=unit, value_gradient_scale=0.3)
+    loss = jax.jit(make_value_gradient_loss(SIMPLE, choices))
+    actual = loss(jnp.float32(1.5), jnp.float32(0.5), inference())
+    expected = sum(slow_loss(critic, unit, 0.3) for critic in (1.5, 0.5)) / 2
+    np.testing.assert_allclose(actual, expected, rtol=2e-4)
+
+
+@pytest.mark.parametrize(("critic", "number"), [("online", 1.5), ("slow", 0.5)])
+def test_either_critic_alone_can_judge(critic, number):
+    loss = make_value_gradient_loss(SIMPLE, model(value_gradient_critic=critic))
+    actual = loss(jnp.float32(1.5), jnp.float32(0.5), inference())
+    np.testing.assert_allclose(actual, slow_loss(number, "symlog", 1.0), rtol=2e-4)
+
+
+@pytest.mark.parametrize(
+    ("form", "function"),
+    [
+        ("taylor", losses.vagram_taylor_loss),
+        ("second_order", losses.vagram_second_order_loss),
+    ],
+)
+def test_the_other_forms_are_those_of_the_library(form, function):
+    choices = model(
+        value_gradient_form=form,
+        value_gradient_unit="raw",
+        value_gradient_critic="online",
+        unimix=0.0,
+    )
+    actual = make_value_gradient_loss(SIMPLE, choices)(jnp.float32(2), (), inference())
+    inferred = inference()
+    h = inferred.latent.deter.mean(-1)
+    flat = [x.stoch.reshape(*SHAPE, 16) for x in (inferred.prior_latent, inferred.latent)]
+    expected = function(lambda z: 2 * jnp.square(z @ WEIGHT) * h, *flat)
+    np.testing.assert_allclose(actual, expected, rtol=1e-4)
+
+
+@functools.cache
+def gradient(**changes):
+    """Of the world model's loss."""
+    config = dataclasses.replace(CONFIG, world_model=model(**changes))
+    agent = make_agent(config, SPEC)
+    loss = objective.make_world_model_loss(agent, config)
+    params, state = jax.jit(agent.init)(jax.random.key(0))
+    params = noisy(params)
+
+    def total(params, slow):
+        return loss(params, state, slow, batch(agent), jax.random.key(1), jnp.asarray(1))
+
+    run = jax.jit(jax.grad(total, has_aux=True, argnums=(0, 1)))
+    (own, slow), (_, _, metrics) = run(params, params.critic)
+    assert norm(slow) == norm(own.critic) == norm(own.actor) == 0.0
+    return own.world_model, metrics
+
+
+def test_vagram_alone_trains_the_prior_and_reaches_h():
+    with_it, metrics = gradient()
+    without, _ = gradient(value_gradient_scale=0.0)
+    assert metrics["loss/value_gradient"] > 0
+    assert metrics["loss/dynamics"] == 0.0
+    assert norm(with_it["rssm"]["prior_net"]) > 0
+    assert norm(without["rssm"]["prior_net"]) == 0.0
+    moved = jax.tree.map(jnp.subtract, with_it, without)
+    assert norm(moved["rssm"]["gru"]) > 0
+    for head in ("decoder", "reward", "cont"):
+        assert norm(moved[head]) == 0.0
+
+
+def test_the_decoder_only_shows_what_rewards_and_values_have_made_of_the_latents():
+    shown, _ = gradient()
+    unseen, _ = gradient(reconstruction_scale=0.0)
+    shaped, _ = gradient(reconstruction_gradient=True)
+    assert norm(shown["decoder"]) > 0
+    assert norm(unseen["decoder"]) == 0.0
+    for part in ("encoder", "rssm"):
+        jax.tree.map(
+            functools.partial(np.testing.assert_allclose, atol=1e-5, rtol=1e-4),
+            shown[part],
+            unseen[part],
+        )
+        assert norm(jax.tree.map(jnp.subtract, shaped[part], shown[part])) > 1e-3
+    np.testing.assert_allclose(norm(shaped["decoder"]), norm(shown["decoder"]), rtol=1e-5)
+
+
+def test_nothing_is_random_but_actions():
+    params, state = jax.jit(AGENT.init)(jax.random.key(0))
+    params, world_model = noisy(params).world_model, AGENT.world_model
+    first, again = (
+        world_model.explain(params, state, jax.random.key(seed), batch(AGENT))[0].inference
+        for seed in (1, 2)
+    )
+    jax.tree.map(np.testing.assert_array_equal, first, again)
+    np.testing.assert_allclose(first.latent.stoch.sum(-1), 1.0, rtol=1e-5)
+    assert (first.latent.stoch.max(-1) < 0.999).all()
+    # Replay keeps the probabilities themselves.
+    kept = world_model.memory(first.latent)
+    jax.tree.map(np.testing.assert_array_equal, kept, first.latent)
