@@ -11,7 +11,7 @@
     vawm.evaluate, vawm.scores          protocols of the suites, and published scores
     vawm.load           a policy from a run's checkpoint
 
-Importing the package registers its tasks with Gymnasium as "vawm/<task>-v0", and
+Importing the package registers its tasks with Gymnasium as `vawm/<task>-v0`, and
 "vawm/GridWorld-v0".
 """
 

@@ -42,7 +42,7 @@ class Flags:
 
     config: Annotated[Config, tyro.conf.arg(name="")]
     logdir: pathlib.Path | None = None
-    """folder of the run; runs/<task>/<preset>-seed<seed>-<time> if not given"""
+    """folder of the run; `runs/<suite>/<task>/<preset>-seed<seed>-<time>` if not given"""
     resume: bool = False
     """continue the run in --logdir, with its own settings as defaults"""
 

@@ -1,4 +1,4 @@
-"""Gymnasium ids "vawm/<task>-v0": strings only, nothing of MuJoCo or JAX is imported."""
+"""Gymnasium ids `vawm/<task>-v0`: strings only, nothing of MuJoCo or JAX is imported."""
 
 from __future__ import annotations
 
