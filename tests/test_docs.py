@@ -1,0 +1,307 @@
+"""Pages and README: their code runs, their commands parse, their links and names exist."""
+
+import ast
+import importlib.util
+import inspect
+import json
+import pathlib
+import re
+import shlex
+import sys
+import typing
+
+import jax
+import pytest
+import tiny
+
+from vawm import command_line, envs, evaluate, flags, presets, runner, suites, validate
+from vawm import policy as policy_lib
+from vawm.agent import make_agent
+from vawm.envs import probes
+
+ROOT = pathlib.Path(__file__).parents[1]
+DOCS, README = ROOT / "docs", ROOT / "README.md"
+PAPER = DOCS / "paper.md"
+PAGES = sorted(DOCS.rglob("*.md"))
+TEXTS = {str(path.relative_to(ROOT)): path.read_text() for path in [README, *PAGES]}
+FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+OTHERS_FLAGS = {"--help", "--strict"}  # of every program, and of mkdocs
+
+
+def load(path):
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[path.stem] = module  # where dataclasses look their types up
+    spec.loader.exec_module(module)
+    return module
+
+
+PROGRAMS = {path.name: load(path) for path in (ROOT / "experiments").glob("*.py")}
+OPTIONS = {  # programs that are no training run
+    "benchmark.py": PROGRAMS["benchmark.py"].Benchmark,
+    "learning_curves.py": PROGRAMS["learning_curves.py"].Options,
+    "vawm.evaluate": evaluate.Arguments,
+}
+gen_reference = load(DOCS / "gen_reference.py")
+
+
+def blocks(text, language):
+    return [code for name, code in FENCE.findall(text) if name == language]
+
+
+def prose(text):
+    """A page without its blocks of code."""
+    return FENCE.sub("", text)
+
+
+def configs():
+    for of_suite in presets.PRESETS.values():
+        for of_name in of_suite.values():
+            yield from of_name.values()
+
+
+def known_flags():
+    """Flag -> what it may be, over all agents and suites."""
+    kinds = {}
+    for config in configs():
+        for flag, kind in flags.known(command_line.Flags, command_line.Flags(config)).items():
+            kinds.setdefault(flag, []).append(kind)
+    return kinds
+
+
+FLAGS = known_flags()
+FIELDS = {flag.removeprefix("--").replace("-", "_"): kinds for flag, kinds in FLAGS.items()}
+ALL_FLAGS = set(FLAGS) | set().union(*(flags.known(options) for options in OPTIONS.values()))
+ALL_FLAGS |= OTHERS_FLAGS | {"--game"}
+
+
+# Code
+
+
+@pytest.fixture
+def stage(tmp_path, monkeypatch):
+    """A folder with a run in it; training is checked and left out, the policy is untrained."""
+    (tmp_path / "LOGDIR").mkdir()
+    line = json.dumps({"env_steps": 16, "episode/return": None})
+    (tmp_path / "LOGDIR" / "metrics.jsonl").write_text(line + "\n")
+    monkeypatch.chdir(tmp_path)
+    trained = []
+
+    def run(config, logdir, *, env=None):
+        runner.check(config, pathlib.Path(logdir), resume=False, known_task=env is None)
+        if env is not None:
+            assert env.spec.num_envs == config.num_envs
+            assert env.spec.action_repeat == config.action_repeat
+        trained.append(config.task)
+
+    def load_policy(logdir):
+        spec = tiny.env().spec
+        agent = make_agent(tiny.CONFIG, spec)
+        params, state = jax.jit(agent.init)(jax.random.key(0))
+        act = jax.jit(agent.act, static_argnames="how")
+        return policy_lib.Policy(tiny.CONFIG, spec, 0, params, state, agent.initial, act)
+
+    def make(task, *, num_envs, action_repeat):
+        assert (task, action_repeat) == (tiny.CONFIG.task, tiny.CONFIG.action_repeat)
+        return probes.make("observation_action", num_envs=num_envs)
+
+    monkeypatch.setattr(runner, "run", run)
+    monkeypatch.setattr(policy_lib, "load", load_policy)
+    monkeypatch.setattr(envs, "make", make)
+    return trained
+
+
+SNIPPETS = {
+    f"{path.stem}-{i}": code
+    for path in PAGES
+    for i, code in enumerate(blocks(path.read_text(), "python"))
+}
+
+
+@pytest.mark.parametrize("name", SNIPPETS)
+def test_the_code_of_a_page_runs(name, stage):
+    exec(SNIPPETS[name], {"__name__": "__main__"})
+    assert len(stage) == SNIPPETS[name].count("runner.run(")
+
+
+def test_the_losses_of_the_guide_leave_the_critic_alone():
+    names = {}
+    exec(SNIPPETS["losses-0"], names)
+    inferred, predicted = names["gradient"]
+    assert names["value"] > 0
+    assert abs(inferred).sum() > 0
+    assert abs(predicted).sum() > 0
+    to_critic = jax.grad(names["alignment"], argnums=1)(
+        (names["inferred"], names["predicted"]),
+        names["critic_params"],
+        names["latent_kl"],
+        jax.numpy.array(20_000),
+    )
+    assert all((leaf == 0).all() for leaf in jax.tree.leaves(to_critic))
+
+
+def test_the_environment_of_the_guide_keeps_the_stream(stage):
+    names = {}
+    exec(SNIPPETS["environment-0"], names)
+    env, step = names["env"], jax.jit(names["env"].step)
+    state, timestep = jax.jit(env.reset)(jax.random.key(0))
+    seen = [timestep]
+    for _ in range(names["LENGTH"] + 1):
+        state, timestep = step(state, jax.numpy.ones((names["N"], 1)))
+        seen.append(timestep)
+    assert [bool(x.is_first.all()) for x in seen] == [True, *[False] * 50, True]
+    assert [bool(x.is_last.any()) for x in seen] == [*[False] * 50, True, False]
+    assert (seen[-1].reward == 0).all()
+    assert (seen[-1].obs != seen[0].obs).any()
+
+
+# Commands and flags
+
+
+def commands(text):
+    """Words of every command that starts one of our programs: (program, arguments)."""
+    lines = "\n".join(blocks(text, "bash")).splitlines()
+    lines += re.findall(r"`(python [^`]+)`", prose(text))
+    for line in lines:
+        for part in line.replace("\n", " ").split("&&"):
+            words = shlex.split(part, comments=True)
+            if words[:1] == ["python"] and words[1:] != [] and words[1] != "-c":
+                yield tuple(words[2:] if words[1] == "-m" else words[1:])
+
+
+COMMANDS = sorted({command for text in TEXTS.values() for command in commands(text)})
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
+def test_a_command_is_one_that_would_start(command, monkeypatch):
+    program, *argv = command
+    program = pathlib.Path(program).name if "/" in program else program
+    if program in OPTIONS:
+        needs = "logdir" in OPTIONS[program].__dataclass_fields__ and "--logdir" not in argv
+        flags.read(OPTIONS[program], argv + ["--logdir", "LOGDIR"] * needs)
+        return
+
+    def check(argv, *, suite, description, aliases=None):
+        if "--resume" in argv:  # of a run that is not here
+            argv = [word for word in argv if word != "--resume"]
+        parsed = command_line.parse(argv, suite=suite, description="", aliases=aliases)
+        validate.check(parsed.config)
+        suites.check_task(parsed.config)
+
+    monkeypatch.setattr(command_line, "train", check)
+    PROGRAMS[program].main(argv)
+
+
+@pytest.mark.parametrize("page", TEXTS)
+def test_every_flag_that_is_mentioned_exists(page):
+    text = re.sub(r"^\|[-| ]+\|$", "", TEXTS[page], flags=re.MULTILINE)  # lines of tables
+    text = re.sub(r"(pip|apt-get|ruff) [^`\n]*", "", text)
+    mentioned = set(re.findall(r"(?<![\w-])--[a-z][\w.-]*(?:\w|\*)", text))
+    groups = {flag.removesuffix("*") for flag in mentioned if flag.endswith("*")}
+    unknown = {flag for flag in mentioned if not flag.endswith("*")} - ALL_FLAGS
+    unknown |= {x for x in groups if not any(flag.startswith(x) for flag in ALL_FLAGS)}
+    assert not unknown
+
+
+# Links
+
+
+def slugs(text):
+    """Anchors of the headings of a page."""
+    titles = re.findall(r"^#+ (.*)$", prose(text), re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", title).strip().lower().replace(" ", "-") for title in titles}
+
+
+def leads_somewhere(page, target):
+    path, _, anchor = target.partition("#")
+    here = (ROOT / page).parent
+    file = (here / path).resolve() if path else ROOT / page
+    if file.is_relative_to(DOCS) and not file.exists():
+        generated = str(file.relative_to(DOCS))
+        return generated in {*gen_reference.pages(), "notebooks.md"} and not anchor
+    return file.exists() and (not anchor or anchor in slugs(file.read_text()))
+
+
+@pytest.mark.parametrize("page", TEXTS)
+def test_every_internal_link_leads_somewhere(page):
+    targets = re.findall(r"\]\(([^)\s]+)\)", prose(TEXTS[page]))
+    inside = [target for target in targets if not re.match(r"https?://", target)]
+    assert not [target for target in inside if not leads_somewhere(page, target)]
+
+
+@pytest.mark.parametrize("page", TEXTS)
+def test_every_reference_names_something_of_the_package(page):
+    for name in set(re.findall(r"\]\[([\w.]+)\]", prose(TEXTS[page]))):
+        found, rest = __import__("vawm"), name.split(".")[1:]
+        assert name.startswith("vawm")
+        for part in rest:
+            found = getattr(found, part)
+
+
+# The page about the paper
+
+
+def rows():
+    """Cells of every row of the page's tables whose last column is the switch."""
+    for table in re.findall(r"(?:^\|.*\n)+", PAPER.read_text(), re.MULTILINE):
+        head, _, *lines = (line.strip("| ").split(" | ") for line in table.splitlines())
+        if head[-1] == "Switch":
+            yield from ((len(head), cells) for cells in lines)
+
+
+def is_choice(text):
+    """Whether `field` or `field=value` is something that a config can say."""
+    name, has_value, value = text.partition("=")
+    if not has_value:
+        return name in FIELDS
+    if name not in FIELDS:
+        return False
+    literals = [kind for kind in FIELDS[name] if typing.get_origin(kind) is typing.Literal]
+    if literals:
+        return any(value in typing.get_args(kind) for kind in literals)
+    return value in ("True", "False") if bool in FIELDS[name] else float(value) is not None
+
+
+def test_every_row_about_the_paper_says_what_switches_it():
+    assert len(list(rows())) > 50
+    for columns, cells in rows():
+        assert len(cells) == columns, cells
+        switches = re.findall(r"`([^`]+)`", cells[-1])
+        assert switches or "no switch" in cells[-1], cells
+        for switch in switches:
+            assert switch in ALL_FLAGS if switch.startswith("--") else is_choice(switch), cells
+
+
+@pytest.mark.parametrize("page", TEXTS)
+def test_every_config_field_that_is_mentioned_exists(page):
+    parts = {name.partition(".")[0] for name in FIELDS if "." in name}
+    names = re.findall(rf"`((?:{'|'.join(parts)})\.\w+)(?:=[^`]*)?`", prose(TEXTS[page]))
+    assert not {name for name in names if name not in FIELDS}
+
+
+# The reference
+
+
+def test_every_module_has_a_page_of_reference_and_a_place_in_the_navigation():
+    files = [path for path in (ROOT / "vawm").rglob("*.py") if path.read_text().strip()]
+    modules = (".".join(path.relative_to(ROOT).with_suffix("").parts) for path in files)
+    pages = gen_reference.pages()
+    assert sorted(pages.values()) == sorted(m.removesuffix(".__init__") for m in modules)
+
+    def leaves(entries):
+        for entry in entries:
+            for value in entry.values():
+                yield from leaves(value) if isinstance(value, list) else [value]
+
+    assert sorted(leaves(gen_reference.navigation())) == sorted(pages)
+
+
+def test_no_docstring_has_words_that_html_would_swallow():
+    for path in (ROOT / "vawm").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if not isinstance(node, ast.Expr) or not isinstance(node.value, ast.Constant):
+                continue
+            lines = inspect.cleandoc(str(node.value.value)).splitlines()
+            text = "\n".join(line for line in lines if not line.startswith("    "))
+            found = re.findall(r"<[a-zA-Z/][^\s>]*>", re.sub(r"`[^`]*`", "", text))
+            assert not found, (path, node.lineno, found)
