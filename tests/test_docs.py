@@ -14,7 +14,7 @@ import jax
 import pytest
 import tiny
 
-from vawm import command_line, envs, evaluate, flags, presets, runner, suites, validate
+from vawm import command_line, envs, flags, presets, runner, suites, validate
 from vawm import policy as policy_lib
 from vawm.agent import make_agent
 from vawm.envs import probes
@@ -36,12 +36,21 @@ def load(path):
     return module
 
 
-PROGRAMS = {path.name: load(path) for path in (ROOT / "experiments").glob("*.py")}
-OPTIONS = {  # programs that are no training run
-    "benchmark.py": PROGRAMS["benchmark.py"].Benchmark,
-    "learning_curves.py": PROGRAMS["learning_curves.py"].Options,
-    "vawm.evaluate": evaluate.Arguments,
+PROGRAMS = {path.stem: load(path) for path in (ROOT / "experiments").glob("*.py")}
+PROGRAMS |= {  # those of the package, `python -m`
+    f"vawm.{path.stem}": importlib.import_module(f"vawm.{path.stem}")
+    for path in (ROOT / "vawm").glob("*.py")
+    if "\ndef main(" in path.read_text()
 }
+
+
+def options(program):
+    """The dataclass that a program reads its flags into; None for a training run."""
+    found = re.search(r"flags\w*\.read\((\w+),", inspect.getsource(program))
+    return getattr(program, found[1]) if found else None
+
+
+OPTIONS = {name: options(program) for name, program in PROGRAMS.items()}
 gen_reference = load(DOCS / "gen_reference.py")
 
 
@@ -71,7 +80,7 @@ def known_flags():
 
 FLAGS = known_flags()
 FIELDS = {flag.removeprefix("--").replace("-", "_"): kinds for flag, kinds in FLAGS.items()}
-ALL_FLAGS = set(FLAGS) | set().union(*(flags.known(options) for options in OPTIONS.values()))
+ALL_FLAGS = set(FLAGS).union(*(flags.known(cls) for cls in OPTIONS.values() if cls))
 ALL_FLAGS |= OTHERS_FLAGS | {"--game"}
 
 
@@ -175,8 +184,8 @@ COMMANDS = sorted({command for text in TEXTS.values() for command in commands(te
 @pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
 def test_a_command_is_one_that_would_start(command, monkeypatch):
     program, *argv = command
-    program = pathlib.Path(program).name if "/" in program else program
-    if program in OPTIONS:
+    program = pathlib.Path(program).stem if "/" in program else program
+    if OPTIONS[program]:
         needs = "logdir" in OPTIONS[program].__dataclass_fields__ and "--logdir" not in argv
         flags.read(OPTIONS[program], argv + ["--logdir", "LOGDIR"] * needs)
         return
