@@ -154,14 +154,16 @@ def test_the_environment_of_the_guide_keeps_the_stream(stage):
     exec(SNIPPETS["environment-0"], names)
     env, step = names["env"], jax.jit(names["env"].step)
     state, timestep = jax.jit(env.reset)(jax.random.key(0))
-    seen = [timestep]
-    for _ in range(names["LENGTH"] + 1):
+    firsts, lasts = [timestep.is_first], [timestep.is_last]
+    for _ in range(2 * names["LENGTH"] + 1):
         state, timestep = step(state, jax.numpy.ones((names["N"], 1)))
-        seen.append(timestep)
-    assert [bool(x.is_first.all()) for x in seen] == [True, *[False] * 50, True]
-    assert [bool(x.is_last.any()) for x in seen] == [*[False] * 50, True, False]
-    assert (seen[-1].reward == 0).all()
-    assert (seen[-1].obs != seen[0].obs).any()
+        firsts.append(timestep.is_first)
+        lasts.append(timestep.is_last)
+        assert (timestep.reward[timestep.is_first] == 0).all()
+    firsts, lasts = jax.numpy.stack(firsts), jax.numpy.stack(lasts)
+    assert jax.numpy.nonzero(firsts.all(1))[0].tolist() == [0, 51]
+    assert jax.numpy.nonzero(lasts.all(1))[0].tolist() == [50, 101]
+    assert firsts.sum() == lasts.sum() == 2 * names["N"]
 
 
 # Commands and flags
