@@ -1,7 +1,7 @@
 """The losses, arrays in and arrays out: no network, environment or configuration.
 
-Equation numbers are the paper's. Every loss is per element; masks, weights and means are the
-caller's.
+Every loss is per element; masks, weights and means are the caller's. Those that need
+derivatives of a model or a critic take it as a function. Equation numbers are the paper's.
 
     prediction_loss, symlog_mse, image_mse, continue_loss     Eq. 3a  what the heads predict
     dynamics_loss, batch_dynamics_loss, balanced_kl           Eq. 3b  prior and posterior
@@ -10,10 +10,22 @@ caller's.
     critic_loss                                               Eq. 7   towards lambda-returns
     actor_loss, discount_weights                              Eq. 8   policy gradient
 
-The family of value-aware losses, from the papers that their docstrings name:
+The value-aware family, from the publications that their docstrings name:
 
-    vagram_loss, vagram_taylor_loss                  weighted by the gradient of the value
-    vagram_second_order_loss, vagram_joint_loss      and by its Hessian
+    vaml_loss                               VAML      the critic that is furthest off
+    iter_vaml_loss                          IterVAML  squared error of the mean value
+    categorical_iter_vaml_loss              MAD-TD    cross-entropy of value distributions
+    cvaml_loss                              CVAML     squared error without its samples' bias
+    vagram_loss                             VaGraM    errors weighted by the value's gradient
+    vagram_taylor_loss                                the first order that it bounds
+    vagram_second_order_loss, vagram_joint_loss       and with the value's curvature
+    lambda_ac_loss, latent_consistency_loss lambda-AC IterVAML of several steps in latents
+    muzero_value_loss, n_step_returns, scale_gradient
+                                            MuZero    model and critic towards returns
+    tempo_meta_gradient                     TEMPO     weights of samples of a likelihood
+
+The critic is the caller's to stop, except for `muzero_value_loss`, which trains it, and
+`tempo_meta_gradient`, which differentiates by the weights alone.
 """
 
 from vawm.losses.behaviour import actor_loss, critic_loss, discount_weights
@@ -27,6 +39,14 @@ from vawm.losses.likelihood import (
     prediction_loss,
     symlog_mse,
 )
+from vawm.losses.multi_step import (
+    lambda_ac_loss,
+    latent_consistency_loss,
+    muzero_value_loss,
+    n_step_returns,
+    scale_gradient,
+)
+from vawm.losses.tempo import tempo_meta_gradient
 from vawm.losses.vagram import (
     vagram_joint_loss,
     vagram_loss,
@@ -34,23 +54,39 @@ from vawm.losses.vagram import (
     vagram_taylor_loss,
 )
 from vawm.losses.value_alignment import value_alignment_loss, value_alignment_weight
+from vawm.losses.value_aware import (
+    categorical_iter_vaml_loss,
+    cvaml_loss,
+    iter_vaml_loss,
+    vaml_loss,
+)
 
 __all__ = [
     "PredictionLoss",
     "actor_loss",
     "balanced_kl",
     "batch_dynamics_loss",
+    "categorical_iter_vaml_loss",
     "continue_loss",
     "critic_loss",
+    "cvaml_loss",
     "discount_weights",
     "dynamics_loss",
     "image_mse",
+    "iter_vaml_loss",
+    "lambda_ac_loss",
+    "latent_consistency_loss",
+    "muzero_value_loss",
+    "n_step_returns",
     "prediction_loss",
+    "scale_gradient",
     "symlog_mse",
+    "tempo_meta_gradient",
     "vagram_joint_loss",
     "vagram_loss",
     "vagram_second_order_loss",
     "vagram_taylor_loss",
     "value_alignment_loss",
     "value_alignment_weight",
+    "vaml_loss",
 ]

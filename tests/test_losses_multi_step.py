@@ -1,0 +1,178 @@
+"""Losses along an unrolled model: float64 twins, cases by hand, and whom they train."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from vawm import losses, returns
+
+lambda_ac_loss = jax.jit(losses.lambda_ac_loss)
+muzero_value_loss = jax.jit(losses.muzero_value_loss)
+n_step_returns = jax.jit(losses.n_step_returns, static_argnames="steps")
+
+
+def batch(steps, shape=(4, 3)):
+    """Values, targets, and a mask that ends some episodes early."""
+    key_value, key_target, key_end = jax.random.split(jax.random.key(0), 3)
+    end = jax.random.randint(key_end, shape, 1, steps + 1)
+    mask = jnp.arange(steps).reshape(-1, *[1] * len(shape)) < end[None]
+    return (
+        jax.random.normal(key_value, (steps, *shape)),
+        jax.random.normal(key_target, (steps, *shape)),
+        mask.astype(jnp.float32),
+    )
+
+
+@pytest.mark.parametrize(
+    ("loss", "weights"),
+    [(lambda_ac_loss, [1] * 5), (muzero_value_loss, [1] + [1 / 4] * 4)],
+)
+@pytest.mark.parametrize("shape", [(), (4, 3)])
+def test_losses_match_their_sums(loss, weights, shape):
+    values, targets, mask = (np.asarray(x, np.float64) for x in batch(5, shape))
+    actual = np.asarray(loss(*batch(5, shape)))
+    assert actual.shape == shape
+    for i in np.ndindex(shape):
+        expected = 0.0
+        for j, weight in enumerate(weights):
+            if mask[j, *i]:
+                expected += weight * (values[j, *i] - targets[j, *i]) ** 2
+        np.testing.assert_allclose(actual[i], expected, rtol=1e-5)
+
+
+def test_losses_by_hand():
+    values, targets = jnp.array([1.0, 2.0, 5.0]), jnp.array([3.0, 1.0, 1.0])
+    mask = jnp.array([1.0, 1.0, 1.0])
+    assert losses.lambda_ac_loss(values, targets, mask) == 4 + 1 + 16
+    assert losses.muzero_value_loss(values, targets, mask) == 4 + (1 + 16) / 2
+    mask = jnp.array([1.0, 1.0, 0.0])
+    assert losses.lambda_ac_loss(values, targets, mask) == 4 + 1
+    assert losses.muzero_value_loss(values, targets, mask) == 4 + 1 / 2
+
+
+def test_a_muzero_that_does_not_unroll_learns_the_value_of_the_encoded_state():
+    one = jnp.ones((1, 2))
+    np.testing.assert_array_equal(losses.muzero_value_loss(3 * one, one, one), [4.0, 4.0])
+
+
+@pytest.mark.parametrize("loss", [lambda_ac_loss, muzero_value_loss])
+def test_losses_move_the_values_alone_and_none_after_the_episode(loss):
+    values, targets, mask = batch(5)
+    gradient = jax.grad(lambda *x: loss(*x).sum(), argnums=(0, 1, 2))
+    to_values, to_targets, to_mask = jax.jit(gradient)(values, targets, mask)
+    np.testing.assert_array_equal(to_targets, np.zeros_like(targets))
+    np.testing.assert_array_equal(to_mask, np.zeros_like(mask))
+    assert ((np.abs(to_values) > 0) == (mask > 0)).all()
+
+
+def linear_losses(loss, critic, model):
+    """A critic V(z) = critic . z on latents z^_j = model^j z_0, against fixed targets."""
+    latents = [jnp.array([1.0, -2.0])]
+    for _ in range(2):
+        latents.append(model @ latents[-1])
+    values = jnp.stack(latents) @ critic
+    return loss(values, jnp.array([1.0, 0.0, 2.0]), jnp.ones(3))
+
+
+def test_muzero_trains_model_and_critic():
+    gradient = jax.grad(linear_losses, argnums=(1, 2))
+    to_critic, to_model = gradient(
+        losses.muzero_value_loss, jnp.array([0.5, 1.0]), jnp.array([[1.0, 0.5], [-0.5, 1.0]])
+    )
+    assert (np.abs(to_critic) > 0).all()
+    assert (np.abs(to_model) > 0).all()
+
+
+def test_lambda_ac_leaves_a_stopped_critic_alone():
+    def loss(critic, model):
+        return linear_losses(losses.lambda_ac_loss, jax.lax.stop_gradient(critic), model)
+
+    to_critic, to_model = jax.grad(loss, argnums=(0, 1))(
+        jnp.array([0.5, 1.0]), jnp.array([[1.0, 0.5], [-0.5, 1.0]])
+    )
+    np.testing.assert_array_equal(to_critic, np.zeros(2))
+    assert (np.abs(to_model) > 0).all()
+
+
+@pytest.mark.parametrize("loss", [losses.lambda_ac_loss, losses.muzero_value_loss])
+def test_losses_refuse_a_target_too_many(loss):
+    values, targets, mask = batch(5)
+    with pytest.raises(AssertionError):
+        loss(values[:-1], targets, mask[:-1])
+    with pytest.raises(AssertionError):
+        loss(values, targets, mask[:1])
+
+
+def experience(steps, shape=(4,)):
+    key_reward, key_discount, key_value = jax.random.split(jax.random.key(1), 3)
+    return (
+        jax.random.normal(key_reward, (steps, *shape)),
+        0.99 * jax.random.bernoulli(key_discount, 0.8, (steps, *shape)),
+        jax.random.normal(key_value, (steps, *shape)),
+    )
+
+
+@pytest.mark.parametrize("steps", [1, 3, 6])
+def test_n_step_returns_match_their_sum(steps):
+    reward, discount, value = (np.asarray(x, np.float64) for x in experience(6))
+    actual = np.asarray(n_step_returns(*experience(6), steps=steps))
+    assert actual.shape == (6 - steps + 1, 4)
+    for t, i in np.ndindex(actual.shape):
+        expected, reached = 0.0, 1.0
+        for k in range(t, t + steps):
+            expected += reached * reward[k, i]
+            reached *= discount[k, i]
+        expected += reached * value[t + steps - 1, i]
+        np.testing.assert_allclose(actual[t, i], expected, rtol=1e-4, atol=1e-6)
+
+
+def test_n_step_returns_by_hand():
+    reward, value = jnp.array([1.0, 10.0, 100.0]), jnp.array([7.0, 8.0, 9.0])
+    discount = jnp.array([0.5, 0.0, 0.5])  # s_2 is terminal
+    np.testing.assert_allclose(
+        losses.n_step_returns(reward, discount, value, steps=1), [4.5, 10.0, 104.5]
+    )
+    np.testing.assert_allclose(
+        losses.n_step_returns(reward, discount, value, steps=2), [6.0, 10.0]
+    )
+
+
+def test_n_step_returns_are_the_ends_of_lambda_returns():
+    one = returns.lambda_returns(*experience(6), lambda_=0.0)
+    whole = returns.lambda_returns(*experience(6), lambda_=1.0)[:1]
+    for steps, expected in [(1, one), (6, whole)]:
+        actual = n_step_returns(*experience(6), steps=steps)
+        np.testing.assert_allclose(actual, expected, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("steps", [0, 7])
+def test_n_step_returns_refuse_more_steps_than_there_are(steps):
+    with pytest.raises(ValueError, match=f"steps={steps}: use a number from 1 to 6"):
+        losses.n_step_returns(*experience(6), steps=steps)
+
+
+def test_scaled_gradients_leave_what_they_scale_exactly_as_it_is():
+    x = jnp.array([0.1, -1e30, 3e-8])
+    value, pullback = jax.vjp(lambda x: losses.scale_gradient(x, scale=0.3), x)
+    np.testing.assert_array_equal(value, x)
+    np.testing.assert_allclose(pullback(jnp.array([1.0, 2.0, -1.0]))[0], [0.3, 0.6, -0.3])
+
+
+def test_consistency_is_the_squared_distance_and_stops_its_target():
+    prediction, target = (
+        jnp.array([[1.0, 2.0], [0.0, 0.0]]),
+        jnp.array([[3.0, 1.0], [0.0, 2.0]]),
+    )
+    np.testing.assert_allclose(losses.latent_consistency_loss(prediction, target), [5.0, 4.0])
+    gradient = jax.grad(lambda *x: losses.latent_consistency_loss(*x).sum(), argnums=(0, 1))
+    to_prediction, to_target = gradient(prediction, target)
+    np.testing.assert_allclose(to_prediction, [[-4.0, 2.0], [0.0, -4.0]])
+    np.testing.assert_array_equal(to_target, np.zeros((2, 2)))
+    with pytest.raises(AssertionError):
+        losses.latent_consistency_loss(prediction, target[:1])
+
+
+@pytest.mark.parametrize("loss", [lambda_ac_loss, muzero_value_loss])
+def test_jit_equals_eager(loss):
+    np.testing.assert_allclose(loss(*batch(5)), loss.__wrapped__(*batch(5)), rtol=1e-5)

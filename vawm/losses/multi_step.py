@@ -1,0 +1,120 @@
+"""Value-aware losses along a model unrolled for several steps, and what goes with them."""
+
+from __future__ import annotations
+
+import chex
+import jax
+import jax.numpy as jnp
+
+Array = jax.Array
+
+
+def lambda_ac_loss(prediction_values: Array, target_values: Array, mask: Array) -> Array:
+    """Multi-step IterVAML of a deterministic latent model: lambda-AC (Voelcker et al., 2023).
+
+        L = sum_j mask_j (V(z^_j) - sg V(phi(x_j)))^2
+
+    z^_j is the model's latent after j steps from an encoded state, phi(x_j) the latent that
+    the encoder makes of what arrived. The original trains V apart from this loss, and adds a
+    reward loss and `latent_consistency_loss`.
+
+    Args:
+      prediction_values: `[H, ...]` V at z^_1..z^_H.
+      target_values: `[H, ...]` V at phi(x_1)..phi(x_H), by the same critic.
+      mask: `[H, ...]` 1 where x_j is of the episode that the rollout started in, else 0.
+
+    Returns:
+      `[...]` losses, in squared units of the values. Targets and mask are stopped; the caller
+      stops the critic's parameters.
+    """
+    chex.assert_equal_shape([prediction_values, target_values, mask])
+    return _masked_squares(prediction_values, target_values, mask).sum(0)
+
+
+def muzero_value_loss(values: Array, returns: Array, mask: Array) -> Array:
+    """Value loss along an unrolled model (Schrittwieser et al., 2020), with squared errors.
+
+        L = mask_0 (v_0 - sg y_0)^2 + 1/K sum_{k=1..K} mask_k (v_k - sg y_k)^2
+
+    v_0 is the value of the encoded state and v_k that after k steps of the model; y_k is
+    bootstrapped from experience, by `n_step_returns`. The weights 1/K are the original's
+    scaling of gradients by 1/K at each head. It also halves gradients where the dynamics
+    take their state in: `scale_gradient(latent, scale=0.5)` before each step. Its reward and
+    policy losses are not here; for a categorical critic it has a cross-entropy instead,
+    `vawm.transforms.two_hot_cross_entropy` to the same returns.
+
+    The critic is NOT frozen: this one loss trains model and critic. Where the environment
+    is stochastic its minimum is not at the true model.
+
+    Args:
+      values: `[K + 1, ...]` v_0..v_K.
+      returns: `[K + 1, ...]` y_0..y_K, from a slow critic or the current one.
+      mask: `[K + 1, ...]` 1 where x_k is of the episode that the unroll started in, else 0.
+
+    Returns:
+      `[...]` losses, in squared units of the values. Returns and mask are stopped.
+    """
+    chex.assert_equal_shape([values, returns, mask])
+    errors = _masked_squares(values, returns, mask)
+    return errors[0] + errors[1:].sum(0) / max(1, len(values) - 1)
+
+
+def n_step_returns(reward: Array, discount: Array, value: Array, *, steps: int) -> Array:
+    """Returns of n steps of experience, bootstrapped with a value.
+
+        y_t = r_{t+1} + d_{t+1} (r_{t+2} + ... + d_{t+n-1} (r_{t+n} + d_{t+n} v_{t+n}))
+
+    As in `vawm.returns.lambda_returns`, all three are indexed by arrival: entry k belongs to
+    s_{k+1}.
+
+    Args:
+      reward: `[T, ...]` r_1..r_T.
+      discount: `[T, ...]` gamma at s_1..s_T, 0 where terminal.
+      value: `[T, ...]` v_1..v_T, in the units of the reward.
+      steps: n, from 1 to T.
+
+    Returns:
+      `[T - n + 1, ...]` y_0..y_{T-n}. Gradients are not stopped here.
+
+    Raises:
+      ValueError: `steps` outside 1..T.
+    """
+    chex.assert_equal_shape([reward, discount, value])
+    if not 1 <= steps <= len(reward):
+        raise ValueError(f"steps={steps}: use a number from 1 to {len(reward)}, the arrivals")
+    count = len(reward) - steps + 1
+    returns = value[steps - 1 :]
+    for k in reversed(range(steps)):
+        returns = reward[k : k + count] + discount[k : k + count] * returns
+    return returns
+
+
+def scale_gradient(x: Array, *, scale: float) -> Array:
+    """`[...]` exactly x, whose gradient is multiplied by `scale`."""
+    stopped = jax.lax.stop_gradient(x)
+    return stopped + scale * (x - stopped)
+
+
+def latent_consistency_loss(prediction: Array, target: Array) -> Array:
+    """Squared distance of a predicted latent to the encoded one, summed over its dims.
+
+        L = |z^_j - sg phi(x_j)|^2
+
+    lambda-AC (Voelcker et al., 2023) adds it to keep latents from drifting to wherever the
+    critic sees no difference; phi is then a slow copy of the encoder, as in BYOL.
+
+    Args:
+      prediction: `[..., D]` latents of the model.
+      target: `[..., D]` latents of the (slow) encoder at the same steps.
+
+    Returns:
+      `[...]` losses. The target is stopped.
+    """
+    chex.assert_equal_shape([prediction, target])
+    return jnp.square(prediction - jax.lax.stop_gradient(target)).sum(-1)
+
+
+def _masked_squares(values: Array, targets: Array, mask: Array) -> Array:
+    """`[H, ...]` squared errors of the values alone, 0 where masked."""
+    targets, mask = jax.lax.stop_gradient((targets, mask))
+    return mask * jnp.square(values - targets)

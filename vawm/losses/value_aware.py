@@ -1,0 +1,111 @@
+"""Value-aware model learning: predict next states that are worth what the true one is worth.
+
+Values come in already computed, by the same critic on both sides; the caller stops that
+critic's parameters, or it learns to be indifferent to the model's errors instead.
+"""
+
+from __future__ import annotations
+
+import chex
+import jax
+import jax.numpy as jnp
+
+Array = jax.Array
+
+
+def vaml_loss(prediction_values: Array, target_values: Array) -> Array:
+    """Value-aware model learning (Farahmand et al., 2017), over an ensemble of critics.
+
+        L = max_k (mean_m V_k(x^_m) - sg V_k(x'))^2
+
+    The original takes the supremum over a class of value functions, of the squared error of
+    the expected value. The maximum over K critics stands in for it, at each element: the mean
+    of these maxima is at least the largest mean error of any of the critics.
+
+    Args:
+      prediction_values: `[K, M, ...]` V_k at M samples x^_m of the model's next state; M = 1
+        for a deterministic model.
+      target_values: `[K, ...]` V_k at the true next state x'.
+
+    Returns:
+      `[...]` losses, in squared units of the values. Targets are stopped; the gradient reaches
+      the critic that is furthest off (shared where critics tie).
+    """
+    return jax.vmap(iter_vaml_loss)(prediction_values, target_values).max(0)
+
+
+def iter_vaml_loss(prediction_values: Array, target_value: Array) -> Array:
+    """Iterative VAML (Farahmand, 2018): VAML with the one critic that is being learned.
+
+        L = (mean_m V(x^_m) - sg V(x'))^2
+
+    The mean over samples stands for the expectation under the model. Its noise raises L by
+    Var[V(x^)] / M on average, which rewards a model for being too certain; `cvaml_loss`
+    takes that out.
+
+    Args:
+      prediction_values: `[M, ...]` V at M samples of the model's next state.
+      target_value: `[...]` V at the true next state.
+
+    Returns:
+      `[...]` losses, in squared units of the values. The target is stopped.
+    """
+    return jnp.square(_deviations(prediction_values, target_value).mean(0))
+
+
+def cvaml_loss(prediction_values: Array, target_value: Array) -> Array:
+    """IterVAML without the bias of its samples: calibrated VAML (Voelcker et al., 2025).
+
+        L = (mean_m V(x^_m) - sg y)^2 - Var[V(x^)] / M
+          = sum over i != j of (V(x^_i) - y) (V(x^_j) - y) / (M (M - 1))
+
+    Var is the unbiased variance of the M samples. Given y, the mean of L over independent
+    samples is (E V(x^) - y)^2. The paper's body was not at hand: the correction is derived
+    here from the bias that it names.
+
+    y = V(x') makes this IterVAML; a value bootstrapped from later steps of experience may
+    stand in its place. The noise of y adds its variance, whatever the model.
+
+    Args:
+      prediction_values: `[M, ...]` V at M >= 2 independent samples of the model's next state.
+      target_value: `[...]` y.
+
+    Returns:
+      `[...]` losses, in squared units of the values; single ones can be negative. The target
+      is stopped.
+
+    Raises:
+      ValueError: fewer than two samples.
+    """
+    samples = prediction_values.shape[0]
+    if samples < 2:
+        raise ValueError(f"prediction_values has {samples} sample: a variance needs two")
+    deviations = _deviations(prediction_values, target_value)
+    bias = deviations.var(0, ddof=1) / samples
+    return jnp.square(deviations.mean(0)) - bias
+
+
+def categorical_iter_vaml_loss(prediction_logits: Array, target_logits: Array) -> Array:
+    """IterVAML between distributions of values, as in the public code of MAD-TD.
+
+        L = -sum_k sg v_k(x') log v_k(x^)
+
+    This is the first term of `value_alignment_loss`, KL[sg v(x') || v(x^)], plus the entropy
+    of the target: it is not 0 where both are equal, and has the same gradient.
+
+    Args:
+      prediction_logits: `[..., bins]` critic logits at the model's next state.
+      target_logits: `[..., bins]` logits of the same critic at the true next state.
+
+    Returns:
+      `[...]` losses in nats. The target is stopped.
+    """
+    chex.assert_equal_shape([prediction_logits, target_logits])
+    target = jax.nn.softmax(jax.lax.stop_gradient(target_logits).astype(jnp.float32))
+    return -(target * jax.nn.log_softmax(prediction_logits.astype(jnp.float32))).sum(-1)
+
+
+def _deviations(prediction_values: Array, target_value: Array) -> Array:
+    """`[M, ...]` by how much each sample's value is above the stopped target."""
+    chex.assert_shape(prediction_values, (None, *target_value.shape))
+    return prediction_values - jax.lax.stop_gradient(target_value)[None]
