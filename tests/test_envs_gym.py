@@ -1,5 +1,7 @@
 """The tasks through Gymnasium."""
 
+import subprocess
+import sys
 import warnings
 
 import gymnasium
@@ -11,14 +13,27 @@ from gymnasium.vector import AutoresetMode
 from vawm.envs import TASKS, registration, split
 from vawm.errors import InvalidInput
 
-registration.register()
-
 
 def test_all_tasks_are_registered_and_twice_is_no_warning():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        registration.register()
+        registration.register(TASKS)
     assert all(f"vawm/{task}-v0" in gymnasium.registry for task in TASKS)
+
+
+def test_an_id_that_names_the_module_needs_no_import_and_loads_no_physics():
+    code = """
+import gymnasium, sys
+assert "vawm/GridWorld-v0" not in gymnasium.registry
+env = gymnasium.make("vawm.envs:vawm/GridWorld-v0")
+import vawm.envs
+assert {f"vawm/{task}-v0" for task in vawm.envs.TASKS} < set(gymnasium.registry)
+assert not {"mujoco", "dm_control", "flax"} & set(sys.modules)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 # Spaces and physics are those of the domain: its other tasks share them.

@@ -9,8 +9,6 @@ from vawm.envs import registration
 from vawm.envs.grid_world import GOAL, WALKER, GridWorld
 from vawm.envs.host import gymnasium as adapter
 
-registration.register()
-
 
 @pytest.fixture
 def world():

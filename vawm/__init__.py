@@ -11,8 +11,8 @@
     vawm.evaluate, vawm.scores          protocols of the suites, and published scores
     vawm.load           a policy from a run's checkpoint
 
-Importing the package registers its tasks with Gymnasium as `vawm/<task>-v0`, and
-"vawm/GridWorld-v0".
+Nothing else is imported with the package, nor by `vawm.losses` but JAX, chex and
+`vawm.transforms`. `import vawm.envs` registers the tasks with Gymnasium.
 """
 
 from __future__ import annotations
@@ -20,12 +20,8 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
-from vawm.envs.registration import register
-
 __version__ = "0.1.0"
 __all__ = ["__version__", "load"]
-
-register()
 
 
 def __getattr__(name: str) -> Any:

@@ -6,6 +6,7 @@
 
 `from_gymnasium` runs any Gymnasium environment, in processes of its own. Importing this
 module is cheap: MuJoCo is loaded by `make`, and what runs processes when it is asked for.
+It registers the tasks with Gymnasium, as "vawm/<task>-v0", and "vawm/GridWorld-v0".
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import difflib
 from typing import TYPE_CHECKING, Any
 
 from vawm.envs.protocol import Environment, EnvState, check_positive
+from vawm.envs.registration import register
 from vawm.errors import InvalidInput
 
 if TYPE_CHECKING:
@@ -35,6 +37,8 @@ DOMAINS = {
     "walker": ("run", "stand", "walk"),
 }
 TASKS = tuple(f"{domain}_{task}" for domain, tasks in DOMAINS.items() for task in tasks)
+
+register(TASKS)
 
 
 def __getattr__(name: str) -> Any:

@@ -1,21 +1,25 @@
-"""Gymnasium ids `vawm/<task>-v0`: strings only, nothing of MuJoCo or JAX is imported."""
+"""Gymnasium ids `vawm/<task>-v0`: strings only, what they name is imported by `make`.
+
+Gymnasium 1.0 and later look for no plugins: an id is known once the module that registers it
+has been imported. `vawm.envs` does so; `vawm.envs:vawm/<task>-v0` has Gymnasium import it.
+"""
 
 from __future__ import annotations
 
-import gymnasium
+from collections.abc import Iterable
 
-from vawm.envs import TASKS
+import gymnasium
 
 GRID_WORLD = "vawm/GridWorld-v0"
 
 
-def register() -> None:
-    """Registers the 18 tasks, single and vectorised, and the grid world; once is enough.
+def register(tasks: Iterable[str]) -> None:
+    """Registers the tasks, single and vectorised, and the grid world; once is enough.
 
     Episodes end in the environment itself, so there is no `max_episode_steps` and no
     TimeLimit wrapper. `action_repeat` is a keyword of `gymnasium.make` and `make_vec`.
     """
-    for task in TASKS:
+    for task in tasks:
         if env_id(task) not in gymnasium.registry:
             gymnasium.register(
                 env_id(task),
