@@ -11,8 +11,8 @@
     vawm.evaluate, vawm.scores          protocols of the suites, and published scores
     vawm.load           a policy from a run's checkpoint
 
-Nothing else is imported with the package, nor by `vawm.losses` but JAX, chex and
-`vawm.transforms`. `import vawm.envs` registers the tasks with Gymnasium.
+Importing the package imports none of them. `vawm.losses` imports neither networks nor
+environments; `vawm.envs` registers its tasks with Gymnasium.
 """
 
 from __future__ import annotations
