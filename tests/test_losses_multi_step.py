@@ -14,14 +14,11 @@ n_step_returns = jax.jit(losses.n_step_returns, static_argnames="steps")
 
 def batch(steps, shape=(4, 3)):
     """Values, targets, and a mask that ends some episodes early."""
-    key_value, key_target, key_end = jax.random.split(jax.random.key(0), 3)
-    end = jax.random.randint(key_end, shape, 1, steps + 1)
-    mask = jnp.arange(steps).reshape(-1, *[1] * len(shape)) < end[None]
-    return (
-        jax.random.normal(key_value, (steps, *shape)),
-        jax.random.normal(key_target, (steps, *shape)),
-        mask.astype(jnp.float32),
-    )
+    rng = np.random.default_rng(0)
+    end = rng.integers(1, steps + 1, size=shape)
+    mask = np.arange(steps).reshape(-1, *[1] * len(shape)) < end
+    values, targets = rng.normal(size=(2, steps, *shape))
+    return tuple(jnp.asarray(x, jnp.float32) for x in (values, targets, mask))
 
 
 @pytest.mark.parametrize(
@@ -105,12 +102,10 @@ def test_losses_refuse_a_target_too_many(loss):
 
 
 def experience(steps, shape=(4,)):
-    key_reward, key_discount, key_value = jax.random.split(jax.random.key(1), 3)
-    return (
-        jax.random.normal(key_reward, (steps, *shape)),
-        0.99 * jax.random.bernoulli(key_discount, 0.8, (steps, *shape)),
-        jax.random.normal(key_value, (steps, *shape)),
-    )
+    rng = np.random.default_rng(1)
+    reward, value = rng.normal(size=(2, steps, *shape))
+    discount = 0.99 * (rng.random((steps, *shape)) < 0.8)
+    return tuple(jnp.asarray(x, jnp.float32) for x in (reward, discount, value))
 
 
 @pytest.mark.parametrize("steps", [1, 3, 6])

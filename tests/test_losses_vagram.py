@@ -44,13 +44,12 @@ def twin(form, gradient, hessian, error):
 
 
 def batch(shape=(2, 3), size=4):
-    weight, out, prediction, target = jax.random.split(jax.random.key(0), 4)
-    critic = jax.random.normal(weight, (5, size)), jax.random.normal(out, (5,))
-    states = (
-        jax.random.normal(prediction, (*shape, size)),
-        jax.random.normal(target, (*shape, size)),
-    )
-    return critic, *states
+    """A critic of five units, predictions and targets."""
+    rng = np.random.default_rng(0)
+    critic, states = rng.normal(size=(5, size + 1)), rng.normal(size=(2, *shape, size))
+    parts = critic[:, 1:], critic[:, 0], *states
+    weight, out, prediction, target = (jnp.asarray(x, jnp.float32) for x in parts)
+    return (weight, out), prediction, target
 
 
 def summed(form):
@@ -66,7 +65,8 @@ def summed(form):
 @pytest.mark.parametrize("shape", [(), (2, 3)])
 def test_losses_match_their_sums_over_written_out_derivatives(form, shape):
     critic, prediction, target = batch(shape)
-    actual = FORMS[form](lambda x: tanh_value(critic, x), prediction, target)
+    loss = jax.jit(lambda *x: FORMS[form](lambda x: tanh_value(critic, x), *x))
+    actual = loss(prediction, target)
     assert actual.shape == shape
     for index in np.ndindex(shape):
         state, guess = (np.asarray(x[index], np.float64) for x in (target, prediction))
@@ -96,14 +96,14 @@ def test_the_first_order_form_is_blind_along_a_plane_and_the_diagonal_one_is_not
 
 def test_the_gradient_of_the_diagonal_form_is_the_weighted_error():
     critic, prediction, target = batch(())
-    actual = jax.grad(summed("diagonal"), argnums=1)(critic, prediction, target)
+    actual = jax.jit(jax.grad(summed("diagonal"), argnums=1))(critic, prediction, target)
     gradient, _ = tanh_derivatives(critic, np.asarray(target, np.float64))
     np.testing.assert_allclose(actual, 2 * gradient**2 * (prediction - target), rtol=1e-4)
 
 
 def test_the_gradient_of_the_second_order_form_goes_through_both_sides_of_the_hessian():
     critic, prediction, target = batch(())
-    actual = jax.grad(summed("second order"), argnums=1)(critic, prediction, target)
+    actual = jax.jit(jax.grad(summed("second order"), argnums=1))(critic, prediction, target)
     gradient, hessian = tanh_derivatives(critic, np.asarray(target, np.float64))
     error = np.asarray(prediction, np.float64) - np.asarray(target, np.float64)
     product = hessian @ error

@@ -18,10 +18,10 @@ categorical_iter_vaml_loss = jax.jit(losses.categorical_iter_vaml_loss)
 
 
 def values(samples, shape=(4, 3)):
-    key_prediction, key_target = jax.random.split(jax.random.key(0))
-    prediction = 3 * jax.random.normal(key_prediction, (*samples, *shape))
-    target = 3 * jax.random.normal(key_target, (*samples[:-1], *shape))
-    return np.asarray(prediction), np.asarray(target)
+    rng = np.random.default_rng(0)
+    prediction = 3 * rng.normal(size=(*samples, *shape))
+    target = 3 * rng.normal(size=(*samples[:-1], *shape))
+    return prediction.astype(np.float32), target.astype(np.float32)
 
 
 def slow_square(samples, target):
@@ -147,7 +147,7 @@ def test_vaml_refuses_critics_without_targets():
 
 
 def logits(shape=(2, 3, 41)):
-    return 2 * jax.random.normal(jax.random.key(0), (2, *shape))
+    return jnp.asarray(2 * np.random.default_rng(0).normal(size=(2, *shape)), jnp.float32)
 
 
 def test_categorical_loss_matches_its_sum():
