@@ -6,29 +6,22 @@
 
 Runs what is missing under `--runs`, `--jobs` at a time (on Linux each on cores of its own),
 and writes `curves_<experiment>.csv` and `.png` to `--results`, of another agent than dreamerv3
-`curves_<experiment>_<agent>`. Interrupted runs are resumed,
-finished ones left alone.
+`curves_<experiment>_<agent>`. Interrupted runs are resumed, finished ones left alone. Ctrl-C
+and SIGTERM stop the runs too, which save before they end.
 """
 
 from __future__ import annotations
 
-import csv
-import dataclasses
-import importlib.util
-import itertools
-import os
 import pathlib
-import subprocess
 import sys
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
-from vawm import checkpoint, command_line, flags, rundir, suites, tracking, validate
-from vawm.envs.protocol import check_positive
-from vawm.errors import InvalidInput
-from vawm.runner import RunError
+from vawm import command_line, flags, validate
+from vawm.config import ValueAlignmentConfig
+from vawm.sweep import children, figures, results, runs
+from vawm.sweep.runs import PROGRAMS, Sweep, Variant
 
 
 class Experiment(NamedTuple):
@@ -44,8 +37,7 @@ EXPERIMENTS = {
     "atari100k": Experiment("atari100k", ("breakout",)),
     "gymnasium_task": Experiment("gymnasium", ("vawm/GridWorld-v0",)),
 }
-RESULTS = pathlib.Path(__file__).with_name("results")
-COLUMNS = ("task", "alignment", "seed", "env_steps", "updates", "minutes", "return")
+FOLDER = pathlib.Path(__file__).resolve().parent
 
 
 @dataclass(frozen=True)
@@ -68,13 +60,9 @@ class Options:
     jobs: int = 1
     """runs side by side"""
     runs: pathlib.Path = pathlib.Path("runs/learning_curves")
-    results: pathlib.Path = RESULTS
+    results: pathlib.Path = FOLDER / "results"
     collect_only: bool = False
     """write the results of the runs that are there, and start none"""
-
-    @property
-    def chosen_tasks(self) -> tuple[str, ...]:
-        return self.tasks or EXPERIMENTS[self.experiment].tasks
 
     @property
     def suite(self) -> str:
@@ -91,177 +79,59 @@ class Options:
         return self.results / f"curves_{self.name}.{ending}"
 
 
-@dataclass(frozen=True)
-class Run:
-    task: str
-    alignment: str
-    seed: int
-
-    def folder(self, options: Options) -> pathlib.Path:
-        name = f"{self.task.replace('/', '-')}-{self.alignment}-seed{self.seed}"
-        return options.runs / options.name / name
-
-    def command(self, options: Options) -> list[str]:
-        folder = self.folder(options)
-        arguments = {
-            "--agent": options.agent,
-            "--task": self.task,
-            "--preset": options.preset,
-            "--seed": str(self.seed),
-            "--value-alignment.weight": self.alignment,
-            "--logdir": str(folder),
-        }
-        if options.env_steps is not None:
-            arguments["--env-steps"] = str(options.env_steps)
-        resume = [] if rundir.read_config(folder) is None else ["--resume"]
-        program = pathlib.Path(__file__).with_name(f"{options.experiment}.py")
-        return [sys.executable, str(program), *itertools.chain(*arguments.items()), *resume]
-
-    def finished(self, options: Options) -> bool:
-        """Whether the newest checkpoint is at the end already."""
-        folder = self.folder(options)
-        newest, config = checkpoint.latest(folder), rundir.read_config(folder)
-        if newest is None or config is None:
-            return False
-        return int(newest.name) >= (options.env_steps or config.env_steps)
+def make_sweep(options: Options) -> Sweep:
+    return Sweep(
+        program=FOLDER / PROGRAMS[options.suite],
+        folder=options.runs / options.name,
+        variants=tuple(
+            Variant(weight, ("--value-alignment.weight", weight))
+            for weight in options.alignments
+        ),
+        tasks=options.tasks or EXPERIMENTS[options.experiment].tasks,
+        seeds=options.seeds,
+        flags=("--agent", options.agent, "--preset", options.preset),
+        env_steps=options.env_steps,
+    )
 
 
-def all_runs(options: Options) -> list[Run]:
-    """Seeds outermost, so that an early stop leaves whole comparisons."""
-    product = itertools.product(options.seeds, options.alignments, options.chosen_tasks)
-    return [Run(task, alignment, seed) for seed, alignment, task in product]
-
-
-def check(options: Options) -> None:
+def check(options: Options, sweep: Sweep) -> None:
     """Refuses what would only fail in every run, or after hours of them.
 
     Raises:
       InvalidInput: names the option, its value and the remedy.
       RunError: a package is missing.
     """
-    config = validate.preset(options.agent, options.suite, options.preset)
-    if options.env_steps is not None:
-        config = dataclasses.replace(config, env_steps=options.env_steps)
-    for seed in options.seeds:
-        validate.check(dataclasses.replace(config, seed=seed))
-    weights = flags.choices(type(config.value_alignment), "weight")
     for weight in options.alignments:
+        weights = flags.choices(ValueAlignmentConfig, "weight")
         validate.check_choice("alignments", weight, weights)
-    for task in options.chosen_tasks:
-        suites.check_task(dataclasses.replace(config, task=task))
-    chosen = {"tasks": options.chosen_tasks, "seeds": options.seeds}
-    for name, values in (chosen | {"alignments": options.alignments}).items():
-        if not values or len(set(values)) < len(values):
-            raise InvalidInput(name, values, "use at least one, and each once")
-    check_positive("jobs", options.jobs)
-    rundir.check_writable(options.results, "results")
-    if not options.collect_only:
-        rundir.check_writable(options.runs, "runs")
-    if importlib.util.find_spec("matplotlib") is None:
-        raise RunError("matplotlib is missing: pip install matplotlib (or vawm[notebooks])")
+    runs.check_distinct("alignments", options.alignments)
+    runs.check(sweep, options.suite)
+    started = None if options.collect_only else options.runs
+    runs.check_places(jobs=options.jobs, runs=started, results=options.results)
 
 
-def train(options: Options) -> dict[Run, int]:
-    """Keeps `jobs` runs going, each with its share of the cores.
-
-    Returns:
-      The exit codes other than 0.
-    """
-    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-    shares = [cores[i :: options.jobs] for i in range(options.jobs)]
-    waiting = [run for run in all_runs(options) if not run.finished(options)]
-    running, failed = dict[int, tuple[Run, subprocess.Popen]](), dict[Run, int]()
-    while waiting or running:
-        for slot in range(options.jobs):
-            if slot in running and running[slot][1].poll() is not None:
-                run, process = running.pop(slot)
-                print(f"{run}: exit code {process.returncode}", flush=True)
-                if process.returncode:
-                    failed[run] = process.returncode
-            if slot not in running and waiting:
-                running[slot] = waiting[0], start(waiting.pop(0), options, shares[slot])
-        time.sleep(1)
-    return failed
-
-
-def start(run: Run, options: Options, cores: list[int]) -> subprocess.Popen:
-    folder = run.folder(options)
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    log = folder.with_suffix(".log").open("a")
-    pin = (lambda: os.sched_setaffinity(0, cores)) if cores else None
-    return subprocess.Popen(run.command(options), stdout=log, stderr=log, preexec_fn=pin)
-
-
-def read(options: Options) -> list[dict]:
-    """A row per line of metrics in which episodes ended."""
-    rows = []
-    for run in all_runs(options):
-        path = run.folder(options) / "metrics.jsonl"
-        for metrics in tracking.read(path) if path.exists() else ():
-            if metrics["episode/return"] is not None:
-                rows.append(
-                    {
-                        "task": run.task,
-                        "alignment": run.alignment,
-                        "seed": run.seed,
-                        "env_steps": metrics["env_steps"],
-                        "updates": metrics["updates"],
-                        "minutes": round(metrics["time"] / 60, 2),
-                        "return": round(metrics["episode/return"], 1),
-                    }
-                )
-    return rows
-
-
-def write_csv(rows: list[dict], path: pathlib.Path) -> None:
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-
-
-def plot(rows: list[dict], options: Options, path: pathlib.Path) -> None:
-    """A panel per task, a line per seed, a colour per kind of alignment."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, panels = plt.subplots(
-        1,
-        len(options.chosen_tasks),
-        figsize=(4.5 * len(options.chosen_tasks), 3.2),
-        squeeze=False,
+def write(rows: results.Rows, options: Options, sweep: Sweep) -> None:
+    options.results.mkdir(parents=True, exist_ok=True)
+    results.write_csv(rows, options.result("csv"), results.headings("alignment"))
+    figures.plot(
+        rows,
+        sweep,
+        options.result("png"),
+        label="value alignment {}",
+        returns=(0, 1000) if options.suite.startswith("dmc") else None,
     )
-    for panel, task in zip(panels[0], options.chosen_tasks, strict=True):
-        for color, alignment in enumerate(options.alignments):
-            for seed in options.seeds:
-                run = Run(task, alignment, seed)
-                chosen = [row for row in rows if row.items() >= vars(run).items()]
-                panel.plot(
-                    [row["env_steps"] / 1000 for row in chosen],
-                    [row["return"] for row in chosen],
-                    color=f"C{color}",
-                    label=f"value alignment {alignment}" if seed == options.seeds[0] else None,
-                )
-        panel.set(title=task, xlabel="thousand environment steps", ylabel="return")
-        if options.suite.startswith("dmc"):
-            panel.set_ylim(0, 1000)
-    panels[0][0].legend()
-    figure.tight_layout()
-    figure.savefig(path, dpi=110)
 
 
-def summary(rows: list[dict], options: Options) -> str:
+def summary(rows: results.Rows, sweep: Sweep) -> str:
     """Per run: the return of its last episodes, its best, and how long it took."""
     lines = []
-    for run in all_runs(options):
-        own = [row for row in rows if row.items() >= vars(run).items()]
+    for run in runs.all_runs(sweep):
+        own = results.of_run(rows, run)
         if own:
             best = max(row["return"] for row in own)
             last = own[-1]
             lines.append(
-                f"{run.task:18} {run.alignment:9} seed {run.seed}: last {last['return']:6.1f} "
+                f"{run.task:18} {run.variant:9} seed {run.seed}: last {last['return']:6.1f} "
                 f"best {best:6.1f} at {last['env_steps']} env steps, "
                 f"{last['updates']} updates, {last['minutes']} min"
             )
@@ -271,16 +141,20 @@ def summary(rows: list[dict], options: Options) -> str:
 def main(argv: Sequence[str] | None = None) -> int:
     """Trains and plots; returns the exit code, 1 if a run failed."""
     options = flags.read(Options, argv, description=__doc__)
-    check(options)
-    failed = {} if options.collect_only else train(options)
-    rows = read(options)
-    options.results.mkdir(parents=True, exist_ok=True)
-    write_csv(rows, options.result("csv"))
-    plot(rows, options, options.result("png"))
-    print(summary(rows, options))
-    for run, code in failed.items():
-        log = run.folder(options).with_suffix(".log")
-        print(f"error: {run} ended with exit code {code}, see {log}", file=sys.stderr)
+    sweep = make_sweep(options)
+    check(options, sweep)
+    failed: list = []
+    if not options.collect_only:
+        outcome = children.run(runs.unfinished_jobs(sweep), at_once=options.jobs)
+        if outcome.exit_code:
+            print("stopped; the same command goes on")
+            return outcome.exit_code
+        failed = outcome.failed
+    rows = results.read(sweep)
+    write(rows, options, sweep)
+    print(summary(rows, sweep))
+    for job, code in failed:
+        print(f"error: {job.name} ended with exit code {code}, see {job.log}", file=sys.stderr)
     return 1 if failed else 0
 
 

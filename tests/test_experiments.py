@@ -1,5 +1,6 @@
 """The scripts beside the main experiment: bad input, and runs that are left to do."""
 
+import dataclasses
 import importlib.util
 import json
 import pathlib
@@ -7,9 +8,8 @@ import sys
 
 import pytest
 import tiny
-import toy
 
-from vawm import checkpoint, command_line, rundir
+from vawm import command_line, rundir
 
 FOLDER = pathlib.Path(__file__).parents[1] / "experiments"
 
@@ -116,70 +116,70 @@ def test_a_benchmark_that_does_not_fit_is_refused(capsys, monkeypatch):
 def options(tmp_path):
     return curves.Options(
         tasks=("cartpole_balance",),
-        seeds=(0, 1, 2),
+        seeds=(0,),
         alignments=("off",),
         runs=tmp_path / "runs",
         results=tmp_path / "results",
     )
 
 
-def saved(folder, env_steps):
-    folder.mkdir(parents=True, exist_ok=True)
-    rundir.write_config(folder, tiny.CONFIG)
-    if env_steps:
-        checkpoint.save(
-            folder,
-            toy.state(),
-            env_steps=env_steps,
-            config=tiny.CONFIG,
-            spec=toy.SPEC,
-            progress={},
-        )
+def words(options):
+    chosen = ["--tasks", *options.tasks, "--alignments", "off", "--seeds", "0"]
+    return [*chosen, "--runs", str(options.runs), "--results", str(options.results)]
 
 
-def test_finished_runs_are_skipped_and_started_ones_resumed(options, monkeypatch):
-    runs = curves.all_runs(options)
-    saved(runs[0].folder(options), 96)
-    saved(runs[1].folder(options), 0)
-    assert [run.finished(options) for run in runs] == [True, False, False]
-    assert ["--resume" in run.command(options) for run in runs] == [True, True, False]
-    longer = curves.dataclasses.replace(options, env_steps=97)
-    assert not runs[0].finished(longer)
-    command = runs[0].command(longer)
-    assert command[command.index("--env-steps") + 1] == "97"
-
-    started = []
-
-    def start(run, *_):
-        started.append(run)
-        script = f"raise SystemExit({run.seed - 1})"
-        return curves.subprocess.Popen([sys.executable, "-c", script])
-
-    monkeypatch.setattr(curves, "start", start)
-    assert curves.train(options) == {runs[2]: 1}
-    assert started == runs[1:]
+def test_the_command_of_a_run_says_all_of_it(options):
+    sweep = curves.make_sweep(dataclasses.replace(options, env_steps=97))
+    (run,) = curves.runs.all_runs(sweep)
+    python, program, *flags = curves.runs.command(sweep, run)
+    assert python == sys.executable
+    assert program == str(FOLDER / "dmc_proprio.py")
+    assert dict(zip(flags[::2], flags[1::2], strict=True)) == {
+        "--agent": "dreamerv3",
+        "--task": "cartpole_balance",
+        "--preset": "quick",
+        "--seed": "0",
+        "--value-alignment.weight": "off",
+        "--env-steps": "97",
+        "--logdir": str(options.runs / "dmc_proprio" / "cartpole_balance-off-seed0"),
+    }
 
 
 def test_a_run_that_failed_is_named_and_half_a_line_survived(options, monkeypatch, capsys):
-    run = curves.all_runs(options)[0]
-    saved(run.folder(options), 0)
+    folder = options.runs / "dmc_proprio" / "cartpole_balance-off-seed0"
+    folder.mkdir(parents=True)
+    rundir.write_config(folder, tiny.CONFIG)
     line = {"env_steps": 8, "updates": 1, "time": 60.0, "episode/return": 12.34}
-    (run.folder(options) / "metrics.jsonl").write_text(json.dumps(line) + '\n{"env_st')
-    monkeypatch.setattr(curves, "train", lambda _: {run: 137})
-    flags = ["--tasks", *options.tasks, "--alignments", "off", "--seeds", "0"]
-    flags += ["--runs", str(options.runs), "--results", str(options.results)]
-    assert curves.main(flags) == 1
+    (folder / "metrics.jsonl").write_text(json.dumps(line) + '\n{"env_st')
+
+    def run(jobs, *, at_once):
+        assert at_once == 1
+        return curves.children.Outcome([(job, 137) for job in jobs], 0)
+
+    monkeypatch.setattr(curves.children, "run", run)
+    assert curves.main(words(options)) == 1
     output = capsys.readouterr()
     assert "last   12.3" in output.out
     assert "exit code 137" in output.err
     assert "seed=0" in output.err
-    assert (options.result("csv")).read_text().count("\n") == 2
-    assert (options.result("png")).stat().st_size
+    table = options.result("csv").read_text().splitlines()
+    assert table == [
+        "task,alignment,seed,env_steps,updates,minutes,return",
+        "cartpole_balance,off,0,8,1,1.0,12.3",
+    ]
+    assert options.result("png").stat().st_size
+
+
+def test_nothing_is_written_when_the_runs_were_stopped(options, monkeypatch, capsys):
+    stopped = curves.children.Outcome([], 143)
+    monkeypatch.setattr(curves.children, "run", lambda *_, **__: stopped)
+    assert curves.main(words(options)) == 143
+    assert "the same command goes on" in capsys.readouterr().out
+    assert not options.results.exists()
 
 
 def test_a_missing_matplotlib_is_told_before_anything_is_trained(options, monkeypatch, capsys):
-    monkeypatch.setattr(curves.importlib.util, "find_spec", lambda _: None)
-    monkeypatch.setattr(curves, "train", None)
-    flags = ["--runs", str(options.runs)]
-    assert command_line.guard(lambda: curves.main(flags)) == 1
+    monkeypatch.setattr(curves.runs.importlib.util, "find_spec", lambda _: None)
+    monkeypatch.setattr(curves.children, "run", None)
+    assert command_line.guard(lambda: curves.main(words(options))) == 1
     assert "pip install matplotlib" in capsys.readouterr().err

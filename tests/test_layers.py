@@ -91,6 +91,7 @@ HOST = {
     "rundir",
     "runner",
     "suites",
+    "sweep",
     "tracking",
     "validate",
     "video",

@@ -1,0 +1,224 @@
+"""One ablation of the paper: its variants, its two scales, and the command line of them all.
+
+`quick` shows within minutes of a CPU that everything works, and how it looks; `paper` has the
+tasks and presets of the paper. Results are `ablation_<name>.csv`, `.md` and `.png`; with
+`_<agent>` for another agent than dreamerv3, and `_paper` for that scale.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import pathlib
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+from vawm import config as config_lib
+from vawm import flags, validate
+from vawm.sweep import children, figures, results, runs
+from vawm.sweep.runs import PROGRAMS, Sweep, Variant
+
+
+class Scale(NamedTuple):
+    """On what the variants are compared, and for how long.
+
+    Attributes:
+      suite: whose program trains.
+      preset: of that suite.
+      tasks, seeds: as many as are named.
+      env_steps: length of a run; that of the preset if None.
+      flags: further ones, of every run.
+    """
+
+    suite: str
+    preset: str
+    tasks: tuple[str, ...]
+    seeds: tuple[int, ...]
+    env_steps: int | None = None
+    flags: tuple[str, ...] = ()
+
+
+QUICK = Scale("dmc_proprio", "quick", ("cartpole_swingup",), (0, 1, 2), env_steps=40_000)
+"""A third of the preset's run: some 4 minutes on one core for DreamerV3."""
+
+TABLE_3 = ("alien", "crazy_climber", "demon_attack", "bank_heist", "battle_zone")
+
+
+def paper(*games: str) -> Scale:
+    """Atari 100k, over the 5 seeds of Tables 1 and 2."""
+    return Scale("atari100k", "paper", games, (0, 1, 2, 3, 4))
+
+
+class Ablation(NamedTuple):
+    """What is compared.
+
+    Attributes:
+      name: of its results.
+      title: the first sentence of the table.
+      variants: of an agent; raises `InvalidInput` where it makes no sense for one.
+      quick, paper: the two scales.
+      factor: what differs between variants: a heading.
+      extra: column -> metric, of what is drawn over time in `ablation_<name>_curves.png`.
+    """
+
+    name: str
+    title: str
+    variants: Callable[[str], tuple[Variant, ...]]
+    quick: Scale
+    paper: Scale
+    factor: str = "value alignment"
+    extra: dict[str, str] = {}  # noqa: RUF012 - never mutated
+
+
+ALIGNMENT = {
+    "value_alignment_loss": "value_alignment/loss",
+    "weight": "value_alignment/weight",
+    "latent_kl": "latent/kl",
+}
+"""Column -> metric: L_var before its weight, the weight of Eq. 5, and KL[q || p] of z."""
+
+ADAPTIVE = ("--value-alignment.weight", "adaptive")
+OFF = ("--value-alignment.weight", "off")
+
+
+@dataclass(frozen=True)
+class Options:
+    """Which runs of an ablation, and where they go."""
+
+    scale: Literal["quick", "paper"] = "quick"
+    """quick: minutes on a CPU with 2 cores; paper: its tasks and presets, on a GPU"""
+    agent: str = "dreamerv3"
+    tasks: tuple[str, ...] = ()
+    """as many as are named; those of the scale if none"""
+    seeds: tuple[int, ...] = ()
+    """those of the scale if none"""
+    env_steps: int | None = None
+    """length of every run; that of the scale if not given"""
+    jobs: int = 1
+    """runs side by side"""
+    runs: pathlib.Path = pathlib.Path("runs/ablations")
+    results: pathlib.Path = pathlib.Path("experiments/results")
+    collect_only: bool = False
+    """write the results of the runs that are there, and start none"""
+
+
+def main(
+    ablation: Ablation, argv: Sequence[str] | None, *, description: str | None, script: str
+) -> int:
+    """What a script does that compares `ablation`; returns the exit code, 1 if a run failed."""
+    options = flags.read(Options, argv, default=defaults(script), description=description)
+    return run(ablation, options, script=script)
+
+
+def defaults(script: str) -> Options:
+    """Results go beside the folder of the script, wherever it is started."""
+    return Options(results=pathlib.Path(script).resolve().parents[1] / "results")
+
+
+def run(ablation: Ablation, options: Options, *, script: str) -> int:
+    """Trains what is missing, then writes the table and the figures; returns the exit code.
+
+    Args:
+      ablation: what is compared.
+      options: which runs, and where they go.
+      script: the file that was started; the programs that train are a folder above it.
+
+    Raises:
+      InvalidInput: before anything is started.
+      RunError: matplotlib is missing.
+    """
+    sweep = make_sweep(ablation, options, pathlib.Path(script).resolve().parents[1])
+    check(ablation, options, sweep)
+    failed: list = []
+    if not options.collect_only:
+        outcome = children.run(runs.unfinished_jobs(sweep), at_once=options.jobs)
+        if outcome.exit_code:
+            print("stopped; the same command goes on")
+            return outcome.exit_code
+        failed = outcome.failed
+    print(write(ablation, options, sweep, command(options, script)))
+    for job, code in failed:
+        print(f"error: {job.name} ended with exit code {code}, see {job.log}", file=sys.stderr)
+    return 1 if failed else 0
+
+
+def scale_of(ablation: Ablation, options: Options) -> Scale:
+    return {"quick": ablation.quick, "paper": ablation.paper}[options.scale]
+
+
+def make_sweep(ablation: Ablation, options: Options, programs: pathlib.Path) -> Sweep:
+    """The runs of an ablation.
+
+    Raises:
+      InvalidInput: there is no such agent, or the ablation makes no sense for it.
+    """
+    scale = scale_of(ablation, options)
+    validate.check_choice("agent", options.agent, config_lib.AGENT_CONFIGS)
+    return Sweep(
+        program=programs / PROGRAMS[scale.suite],
+        folder=options.runs / result_name(ablation, options),
+        variants=ablation.variants(options.agent),
+        tasks=options.tasks or scale.tasks,
+        seeds=options.seeds or scale.seeds,
+        flags=("--agent", options.agent, "--preset", scale.preset, *scale.flags),
+        env_steps=options.env_steps if options.env_steps is not None else scale.env_steps,
+    )
+
+
+def check(ablation: Ablation, options: Options, sweep: Sweep) -> None:
+    """Refuses what would only fail in every run, or after hours of them."""
+    runs.check(sweep, scale_of(ablation, options).suite)
+    started = None if options.collect_only else options.runs
+    runs.check_places(jobs=options.jobs, runs=started, results=options.results)
+
+
+def result_name(ablation: Ablation, options: Options) -> str:
+    """Of files and folders."""
+    agent = "" if options.agent == "dreamerv3" else f"_{options.agent}"
+    scale = "" if options.scale == "quick" else f"_{options.scale}"
+    return f"ablation_{ablation.name}{agent}{scale}"
+
+
+def write(ablation: Ablation, options: Options, sweep: Sweep, made_by: str) -> str:
+    """Writes table and figures of what is there; returns the table in Markdown."""
+    columns = results.RETURN | ablation.extra
+    rows = results.read(sweep, columns)
+    options.results.mkdir(parents=True, exist_ok=True)
+    path = options.results / result_name(ablation, options)
+    results.write_csv(rows, path.with_suffix(".csv"), results.headings("variant", columns))
+    table = results.markdown(
+        results.summarise(sweep, rows, columns),
+        factor=ablation.factor,
+        command=made_by,
+        notes=f"{ablation.title} {setting(options, sweep)}",
+    )
+    path.with_suffix(".md").write_text(table)
+    figures.plot(rows, sweep, path.with_suffix(".png"), seeds="band")
+    if ablation.extra:
+        curves = path.with_name(path.name + "_curves.png")
+        figures.plot(rows, sweep, curves, quantities=tuple(ablation.extra), seeds="band")
+    return table
+
+
+def setting(options: Options, sweep: Sweep) -> str:
+    """What all runs have in common, and how the numbers are to be read."""
+    length = "" if sweep.env_steps is None else f", {sweep.env_steps:,} environment steps"
+    preset = sweep.flags[sweep.flags.index("--preset") + 1]
+    return (
+        f"Agent {options.agent}, preset {preset} of {sweep.program.name}{length}; returns of "
+        "the training episodes. Mean +- standard error over seeds; the mean return is the area "
+        "under the curve per environment step."
+    )
+
+
+def command(options: Options, script: str) -> str:
+    """The command line of `options`, without what changes no number."""
+    words = ["python", "experiments/ablations/" + pathlib.Path(script).name]
+    silent = ("jobs", "runs", "results", "collect_only")
+    for field in dataclasses.fields(options):
+        value = getattr(options, field.name)
+        if field.name not in silent and value != field.default:
+            values = map(str, value) if isinstance(value, tuple) else [str(value)]
+            words += ["--" + field.name.replace("_", "-"), *values]
+    return " ".join(words)

@@ -1,0 +1,87 @@
+"""Child processes side by side; whoever stops their parent stops them too."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pathlib
+import subprocess
+import time
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from vawm import signals
+
+POLL_SECONDS = 0.1
+"""Well below `signals.BURST_SECONDS`: a child to which a terminal has sent Ctrl-C already takes
+what follows from here for the same request."""
+
+
+class Job(NamedTuple):
+    """A command, and the file to which all that it prints is appended."""
+
+    name: str
+    command: Sequence[str]
+    log: pathlib.Path
+
+
+class Outcome(NamedTuple):
+    """How they ended.
+
+    Attributes:
+      failed: jobs that ended by themselves, with another exit code than 0.
+      exit_code: 0, or what a shell expects after the signal that stopped this process.
+    """
+
+    failed: list[tuple[Job, int]]
+    exit_code: int
+
+
+def run(jobs: Sequence[Job], *, at_once: int) -> Outcome:
+    """Keeps `at_once` jobs going, on Linux each with its share of the cores.
+
+    At Ctrl-C or SIGTERM no further one is started; those that are running get a SIGTERM, upon
+    which a run of ours saves, and this returns when all have ended. At a second signal this
+    process ends at once, and they go on saving.
+    """
+    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+    shares = [cores[i::at_once] for i in range(at_once)]
+    waiting, failed = list(jobs), list[tuple[Job, int]]()
+    running = dict[int, tuple[Job, subprocess.Popen]]()
+    with signals.catch(lambda: print("stopping the runs ...", flush=True)) as stop:
+        try:
+            while stop.signal is None and (waiting or running):
+                failed += _ended(running)
+                for slot in range(at_once):
+                    if slot not in running and waiting and stop.signal is None:
+                        job = waiting.pop(0)
+                        running[slot] = job, _start(job, shares[slot])
+                time.sleep(POLL_SECONDS)
+        finally:
+            for _, process in running.values():
+                process.terminate()
+            for _, process in running.values():
+                process.wait()
+        return Outcome(failed, stop.exit_code)
+
+
+def _ended(running: dict[int, tuple[Job, subprocess.Popen]]) -> list[tuple[Job, int]]:
+    """Takes those that have ended out of `running`; returns which of them failed."""
+    failed = []
+    for slot, (job, process) in list(running.items()):
+        if process.poll() is not None:
+            del running[slot]
+            print(f"{job.name}: exit code {process.returncode}", flush=True)
+            if process.returncode:
+                failed.append((job, process.returncode))
+    return failed
+
+
+def _start(job: Job, cores: Sequence[int]) -> subprocess.Popen:
+    job.log.parent.mkdir(parents=True, exist_ok=True)
+    with job.log.open("a") as log:
+        process = subprocess.Popen(job.command, stdout=log, stderr=log)
+    if cores:  # threads that it starts from now on inherit them
+        with contextlib.suppress(ProcessLookupError):
+            os.sched_setaffinity(process.pid, cores)
+    return process

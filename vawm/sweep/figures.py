@@ -1,0 +1,92 @@
+"""Learning curves: a panel per task and quantity, a colour per variant."""
+
+from __future__ import annotations
+
+import pathlib
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+
+from vawm.sweep.results import Rows, of_run
+from vawm.sweep.runs import Run, Sweep
+
+
+def plot(
+    rows: Rows,
+    sweep: Sweep,
+    path: pathlib.Path,
+    *,
+    quantities: Sequence[str] = ("return",),
+    label: str = "{}",
+    seeds: Literal["lines", "band"] = "lines",
+    returns: tuple[float, float] | None = None,
+) -> None:
+    """Draws `rows` of `results.read` and writes a PNG.
+
+    Args:
+      rows: what was measured.
+      sweep: whose tasks, variants and seeds these are.
+      path: of the PNG.
+      quantities: columns, a row of panels for each.
+      label: of a variant in the legend, with `{}` for its name.
+      seeds: a line for each; or their mean, in a band from the lowest to the highest, over
+        the steps that all of them have.
+      returns: lower and upper end of the axis of returns; as the data need it if None.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    width, height = len(sweep.tasks), len(quantities)
+    size = (4.5 * width, 3.2 * height)
+    figure, panels = plt.subplots(height, width, figsize=size, squeeze=False)
+    draw = {"lines": _lines, "band": _band}[seeds]
+    for quantity, line in zip(quantities, panels, strict=True):
+        for task, panel in zip(sweep.tasks, line, strict=True):
+            for color, variant in enumerate(sweep.variants):
+                owned = [Run(task, variant.name, seed) for seed in sweep.seeds]
+                curves = [of_run(rows, run, quantity) for run in owned]
+                draw(panel, curves, quantity, f"C{color}", label.format(variant.name))
+            named = quantity.replace("_", " ")
+            panel.set(title=task, xlabel="thousand environment steps", ylabel=named)
+            if seeds == "band":
+                panel.legend()
+            if quantity == "return" and returns is not None:
+                panel.set_ylim(*returns)
+    panels[0][0].legend()
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def _lines(panel, curves: Sequence[Rows], quantity: str, color: str, label: str) -> None:
+    for number, rows in enumerate(curves):
+        steps = [row["env_steps"] / 1000 for row in rows]
+        values = [row[quantity] for row in rows]
+        panel.plot(steps, values, color=color, label=None if number else label)
+
+
+def _band(panel, curves: Sequence[Rows], quantity: str, color: str, label: str) -> None:
+    """A legend tells how many seeds there are where some are missing."""
+    steps, values = interpolated([rows for rows in curves if rows], quantity)
+    if len(values) < len(curves):
+        label += f" ({len(values)} of {len(curves)} seeds)"
+    panel.plot(steps / 1000, values.mean(0) if len(values) else [], color=color, label=label)
+    if len(values) > 1:
+        low, high = values.min(0), values.max(0)
+        panel.fill_between(steps / 1000, low, high, color=color, alpha=0.2, linewidth=0)
+
+
+def interpolated(curves: Sequence[Rows], quantity: str) -> tuple[np.ndarray, np.ndarray]:
+    """`[N]` env steps at which any of the curves has a value and all lie around, and `[S, N]`
+    the values of each there, straight between its own."""
+    if not curves:
+        return np.zeros(0), np.zeros((0, 0))
+    steps = [np.array([row["env_steps"] for row in rows]) for rows in curves]
+    values = [np.array([row[quantity] for row in rows]) for rows in curves]
+    grid = np.unique(np.concatenate(steps))
+    first, last = max(s[0] for s in steps), min(s[-1] for s in steps)
+    grid = grid[(grid >= first) & (grid <= last)]
+    return grid, np.stack([np.interp(grid, s, v) for s, v in zip(steps, values, strict=True)])

@@ -1,0 +1,180 @@
+"""What the runs of a sweep measured: rows, aggregates over seeds, tables."""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import math
+import pathlib
+import statistics
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+from vawm import tracking
+from vawm.sweep import runs
+from vawm.sweep.runs import Run, Sweep
+
+Rows = list[dict[str, Any]]
+
+RETURN = {"return": "episode/return"}
+"""Column -> metric, of what every sweep is about."""
+
+
+class Summary(NamedTuple):
+    """One variant in one task, over the seeds whose runs are finished, one entry for each.
+
+    Attributes:
+      task, variant: which.
+      seeds: those that count.
+      missing: seed -> why it does not count.
+      last: column -> the last value of each run.
+      best: the highest return.
+      area: the area under the curve of returns per env step: the mean return.
+      minutes: wall time of the run.
+    """
+
+    task: str
+    variant: str
+    seeds: tuple[int, ...]
+    missing: dict[int, str]
+    last: dict[str, list[float]]
+    best: list[float]
+    area: list[float]
+    minutes: list[float]
+
+
+def read(sweep: Sweep, columns: Mapping[str, str] = RETURN) -> Rows:
+    """A row per line of metrics that has at least one of `columns`; the others are None."""
+    rows = []
+    for run in runs.all_runs(sweep):
+        path = runs.folder(sweep, run) / "metrics.jsonl"
+        for metrics in tracking.read(path) if path.exists() else ():
+            measured = {
+                name: rounded(name, metrics.get(metric)) for name, metric in columns.items()
+            }
+            if any(value is not None for value in measured.values()):
+                counted = {name: metrics[name] for name in ("env_steps", "updates")}
+                minutes = round(metrics["time"] / 60, 2)
+                rows.append(vars(run) | counted | {"minutes": minutes} | measured)
+    return rows
+
+
+def rounded(column: str, value: float | None) -> float | None:
+    """Returns to a tenth, all else to 5 digits."""
+    if value is None:
+        return None
+    return round(value, 1) if column == "return" else float(f"{value:.5g}")
+
+
+def of_run(rows: Rows, run: Run, column: str = "return") -> Rows:
+    """The rows of one run in which `column` was measured."""
+    return [row for row in rows if row.items() >= vars(run).items() and row[column] is not None]
+
+
+def area(rows: Rows) -> float:
+    """Area under the returns by the trapezoidal rule, per env step; needs one row at least."""
+    width = rows[-1]["env_steps"] - rows[0]["env_steps"]
+    if not width:
+        return rows[0]["return"]
+    parts = [
+        (b["env_steps"] - a["env_steps"]) * (a["return"] + b["return"]) / 2
+        for a, b in itertools.pairwise(rows)
+    ]
+    return sum(parts) / width
+
+
+def missing(sweep: Sweep, rows: Rows, run: Run) -> str | None:
+    """Why a run does not count; None where it does."""
+    own, length = of_run(rows, run), runs.env_steps(sweep, run)
+    if not own or length is None:
+        return "has no returns"
+    if own[-1]["env_steps"] < length and not runs.finished(sweep, run):
+        return f"is at {own[-1]['env_steps']:,} of {length:,} env steps"
+    return None
+
+
+def summarise(sweep: Sweep, rows: Rows, columns: Mapping[str, str] = RETURN) -> list[Summary]:
+    """A summary for each task and variant; seeds that are missing are named in it."""
+    summaries = []
+    for task in sweep.tasks:
+        for variant in sweep.variants:
+            chosen = {seed: Run(task, variant.name, seed) for seed in sweep.seeds}
+            absent = {seed: missing(sweep, rows, run) for seed, run in chosen.items()}
+            counted = [run for seed, run in chosen.items() if absent[seed] is None]
+            returns = [of_run(rows, run) for run in counted]
+            last = {
+                name: [own[-1][name] for run in counted if (own := of_run(rows, run, name))]
+                for name in columns
+            }
+            summaries.append(
+                Summary(
+                    task=task,
+                    variant=variant.name,
+                    seeds=tuple(run.seed for run in counted),
+                    missing={seed: why for seed, why in absent.items() if why is not None},
+                    last=last,
+                    best=[max(row["return"] for row in own) for own in returns],
+                    area=[area(own) for own in returns],
+                    minutes=[own[-1]["minutes"] for own in returns],
+                )
+            )
+    return summaries
+
+
+def mean_and_error(values: Sequence[float]) -> str:
+    """Mean and its standard error: sample deviation / sqrt(n), which a single value has not."""
+    if not values:
+        return "-"
+    mean = statistics.mean(values)
+    style = ".1f" if abs(mean) >= 10 else ".3g"
+    if len(values) == 1:
+        return format(mean, style)
+    error = statistics.stdev(values) / math.sqrt(len(values))
+    return f"{mean:{style}} +- {error:{style}}"
+
+
+def markdown(summaries: Sequence[Summary], *, factor: str, command: str, notes: str) -> str:
+    """A table of means over seeds, the seeds that are missing in it, and what made it.
+
+    Args:
+      summaries: at least one.
+      factor: what differs between variants: a heading.
+      command: how to make it again.
+      notes: a paragraph before the table.
+    """
+    others = [name for name in summaries[0].last if name != "return"]
+    names = [name.replace("_", " ") for name in others]
+    heads = ["task", factor, "seeds", "last return", "best", "mean return", *names, "minutes"]
+    lines = [notes, "", _row(heads), _row(["---"] * len(heads))]
+    for s in summaries:
+        total = len(s.seeds) + len(s.missing)
+        count = f"{total}" if not s.missing else f"**{len(s.seeds)} of {total}**"
+        measured = [s.last["return"], s.best, s.area, *(s.last[name] for name in others)]
+        minutes = f"{statistics.mean(s.minutes):.1f}" if s.minutes else "-"
+        cells = [s.task, s.variant, count, *map(mean_and_error, measured), minutes]
+        lines.append(_row(cells))
+    lines.append("")
+    for s in summaries:
+        for seed, why in s.missing.items():
+            lines.append(f"- Not in the means: {s.task}, {s.variant}, seed {seed}: {why}.")
+    if any(s.missing for s in summaries):
+        lines.append("")
+    return "\n".join([*lines, f"Made by `{command}`.", ""])
+
+
+def _row(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cells) + " |"
+
+
+def write_csv(rows: Rows, path: pathlib.Path, columns: Mapping[str, str]) -> None:
+    """Writes `rows`; `columns` are column -> heading, in the order of the file."""
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(columns.values())
+        writer.writerows([row[name] for name in columns] for row in rows)
+
+
+def headings(factor: str, columns: Mapping[str, str] = RETURN) -> dict[str, str]:
+    """Column -> heading of the rows of `read`; that of the variant is `factor`."""
+    names = ("task", "variant", "seed", "env_steps", "updates", "minutes", *columns)
+    return {name: factor if name == "variant" else name for name in names}
