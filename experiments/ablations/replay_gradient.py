@@ -1,0 +1,56 @@
+"""Ablation of the replay value loss's gradient, crossed with value alignment.
+
+    python experiments/ablations/replay_gradient.py --jobs 2
+    python experiments/ablations/replay_gradient.py --scale paper
+
+DreamerV3 as it is has the critic learn the values of replayed states too, and sends the
+gradient of that loss into the world model: it is value-aware before L_var is added. That is
+the main confound of comparisons with and without value alignment. Without that gradient one
+sees what L_var does by itself. STORM has no replay value loss, so it is refused.
+"""
+
+from __future__ import annotations
+
+import itertools
+import sys
+from collections.abc import Sequence
+
+from vawm import command_line, validate
+from vawm.errors import InvalidInput
+from vawm.sweep import ablation
+from vawm.sweep.runs import Variant
+
+GRADIENTS = {
+    "on": ("--critic.replay-gradient",),
+    "off": ("--critic.no-replay-gradient",),
+}
+ALIGNMENTS = {"adaptive": ablation.ADAPTIVE, "off": ablation.OFF}
+
+
+def variants(agent: str) -> tuple[Variant, ...]:
+    """All four; none for an agent without the loss."""
+    if not validate.preset(agent, "dmc_proprio", "quick").critic.replay_scale:
+        raise InvalidInput("agent", agent, "has no replay value loss; use dreamerv3")
+    return tuple(
+        Variant(f"{alignment}, replay gradient {gradient}", ALIGNMENTS[alignment] + words)
+        for alignment, (gradient, words) in itertools.product(ALIGNMENTS, GRADIENTS.items())
+    )
+
+
+ABLATION = ablation.Ablation(
+    name="replay_gradient",
+    title="Value alignment with and without the replay value loss in the world model.",
+    variants=variants,
+    quick=ablation.QUICK,
+    paper=ablation.paper(*ablation.TABLE_3),
+    extra=ablation.ALIGNMENT,
+)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Trains and writes the table; returns the exit code, 1 if a run failed."""
+    return ablation.main(ABLATION, argv, description=__doc__, script=__file__)
+
+
+if __name__ == "__main__":
+    sys.exit(command_line.guard(main))
