@@ -17,7 +17,6 @@ import dataclasses
 import functools
 import json
 import os
-import resource
 import statistics
 import sys
 import time
@@ -45,6 +44,7 @@ from vawm.envs.protocol import check_positive
 from vawm.errors import InvalidInput
 from vawm.learn import Draw
 from vawm.learner import init_learner, make_update
+from vawm.overhead import peak_process_bytes, percent_more, quartiles
 from vawm.presets import PAPER, STORM
 from vawm.types import Batch, EnvSpec, Trajectory, image, vector
 from vawm.world_model.codecs import check_image_size
@@ -232,14 +232,6 @@ def check_memory(agent, config: Config) -> None:
         raise InvalidInput("size", config.size, remedy)
 
 
-def quartiles(values: Sequence[float]) -> list[float]:
-    """The first and the third; both the value itself where there is only one."""
-    if len(values) == 1:
-        return [values[0], values[0]]
-    first, _, third = statistics.quantiles(values, n=4, method="inclusive")
-    return [first, third]
-
-
 def run(options: Benchmark) -> dict:
     config = make_config(options)
     agent = make_agent(config, make_spec(options))
@@ -257,7 +249,7 @@ def run(options: Benchmark) -> dict:
     on = TimedUpdate(agent, config, batch, aligned=True)
     for _ in range(2):
         on.run()
-    peak_rss_gb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    peak_rss_gb = peak_process_bytes() / 2**30
     off = TimedUpdate(agent, plain, batch, aligned=False)
     for _ in range(2):
         off.run()
@@ -265,7 +257,7 @@ def run(options: Benchmark) -> dict:
     for _ in range(options.repeats):
         on.run()
         off.run()
-    overheads = [100 * (a / b - 1) for a, b in zip(on.seconds, off.seconds, strict=True)]
+    overheads = percent_more(on.seconds, off.seconds)
     if options.obs == "pixels":
         collected: dict = {"frames_per_s_by_workers": frames_per_s(options, config)}
         collected["fast_rendering"] = options.fast_rendering

@@ -84,6 +84,7 @@ HOST = {
     "flags",
     "manifest",
     "memory",
+    "overhead",
     "play",
     "policy",
     "program",

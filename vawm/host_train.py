@@ -85,9 +85,17 @@ def first_timestep(spec: EnvSpec) -> TimeStep:
 
 
 def compile_programs(
-    spec: EnvSpec, agent: Agent, config: Config, state: TrainState
+    spec: EnvSpec,
+    agent: Agent,
+    config: Config,
+    state: TrainState,
+    *,
+    kept: Callable[[str], bool] = lambda name: True,
 ) -> Compiled:
-    """Compiles the programs of a step for states like `state`; shapes are enough."""
+    """Compiles the programs of a step for states like `state`; shapes are enough.
+
+    Of what `update` measures, only the names that are `kept` are computed.
+    """
     key = jax.eval_shape(lambda: jax.random.key(0))
     positions = jax.eval_shape(lambda: _positions(config))
     images = jax.eval_shape(lambda: _images(spec, config))
@@ -98,7 +106,7 @@ def compile_programs(
     def build(function: Callable, donate: tuple[int, ...], *arguments: Any) -> Any:
         return jax.jit(function, donate_argnums=donate).lower(*arguments).compile()
 
-    update = _make_update(agent, config)
+    update = _make_update(agent, config, kept)
     arguments = learner, buffer, positions, images, key, number, number
     return Compiled(
         depart=build(
@@ -219,12 +227,13 @@ def _make_arrive(spec: EnvSpec) -> Callable:
     return take_in
 
 
-def _make_update(agent: Agent, config: Config) -> Callable:
+def _make_update(agent: Agent, config: Config, kept: Callable[[str], bool]) -> Callable:
     update_at = learn.make_update_at(agent, config)
 
     def update(learner, buffer, positions, images, key, number, env_steps):
         key = jax.random.fold_in(key, number)
-        return update_at(learner, buffer, positions, images, key, env_steps)
+        learner, buffer, metrics = update_at(learner, buffer, positions, images, key, env_steps)
+        return learner, buffer, {name: x for name, x in metrics.items() if kept(name)}
 
     return update
 

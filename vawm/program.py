@@ -21,6 +21,12 @@ from vawm.types import EnvSpec, PyTree
 
 Step = Callable[[TrainState], tuple[TrainState, Mapping[str, Any]]]
 Arrays = dict[str, np.ndarray]
+Kept = Callable[[str], bool]
+"""Whether a metric, by its name, is to be measured."""
+
+
+def everything(name: str) -> bool:
+    return True
 
 
 class Program(NamedTuple):
@@ -49,8 +55,15 @@ class Program(NamedTuple):
     close: Callable[[], None]
 
 
-def make(config: Config, env: Environment | HostEnvironment | None = None) -> Program:
+def make(
+    config: Config,
+    env: Environment | HostEnvironment | None = None,
+    *,
+    kept: Kept = everything,
+) -> Program:
     """The functions that train `config`, in `env` or the environments that it names.
+
+    Metrics that are not `kept` are not computed either, but for what updates need anyway.
 
     Raises:
       InvalidInput: environments that cannot be made, or choices that they do not allow.
@@ -60,18 +73,26 @@ def make(config: Config, env: Environment | HostEnvironment | None = None) -> Pr
         validate.check_spec(config, env.spec)
         agent = make_agent(config, env.spec)
         if isinstance(env, Environment):
-            return on_device(env, agent, config)
-        return on_host(env, agent, config)
+            return on_device(env, agent, config, kept)
+        return on_host(env, agent, config, kept)
     except BaseException:
         if not isinstance(env, Environment):
             env.close()
         raise
 
 
-def on_device(env: Environment, agent: Agent, config: Config) -> Program:
+def on_device(
+    env: Environment, agent: Agent, config: Config, kept: Kept = everything
+) -> Program:
     """Simulation, replay and learning in one jitted step."""
+    train_step = train.make_train_step(env, agent, config)
+
+    def train_step_kept(state: TrainState):
+        state, metrics = train_step(state)
+        return state, {name: value for name, value in metrics.items() if kept(name)}
+
     init = jax.jit(functools.partial(train.init, env, agent, config))
-    step = jax.jit(train.make_train_step(env, agent, config), donate_argnums=0)
+    step = jax.jit(train_step_kept, donate_argnums=0)
     return Program(
         spec=env.spec,
         agent=agent,
@@ -84,7 +105,9 @@ def on_device(env: Environment, agent: Agent, config: Config) -> Program:
     )
 
 
-def on_host(env: HostEnvironment, agent: Agent, config: Config) -> Program:
+def on_host(
+    env: HostEnvironment, agent: Agent, config: Config, kept: Kept = everything
+) -> Program:
     """The same update around environments on the host."""
     spec, seed = env.spec, config.seed
     begin = jax.jit(functools.partial(host_train.init, agent, config))
@@ -101,7 +124,7 @@ def on_host(env: HostEnvironment, agent: Agent, config: Config) -> Program:
         return state._replace(images=images())
 
     def compile_step(state: TrainState) -> Step:
-        programs = host_train.compile_programs(spec, agent, config, state)
+        programs = host_train.compile_programs(spec, agent, config, state, kept=kept)
         return host_train.make_step(env, config, programs)
 
     def resume(state: TrainState, episodes: Arrays | None) -> tuple[TrainState, int]:

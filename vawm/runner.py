@@ -138,13 +138,20 @@ def check(
         rundir.check_new(logdir)
 
 
-def prepare(config: Config, env: Environment | HostEnvironment | None = None) -> Program:
+def prepare(
+    config: Config,
+    env: Environment | HostEnvironment | None = None,
+    *,
+    kept: program_lib.Kept = program_lib.everything,
+) -> Program:
     """Builds the run's functions and refuses one that does not fit into memory.
+
+    Metrics that are not `kept` are not computed either.
 
     Raises:
       InvalidInput: with the numbers, and the largest replay that would fit.
     """
-    program = program_lib.make(config, env)
+    program = program_lib.make(config, env, kept=kept)
     try:
         memory.check(
             memory.estimate(program.shapes, program.spec, config),

@@ -12,7 +12,7 @@ import pathlib
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from vawm import config as config_lib
 from vawm import flags, validate
@@ -191,7 +191,7 @@ def write(ablation: Ablation, options: Options, sweep: Sweep, made_by: str) -> s
         results.summarise(sweep, rows, columns),
         factor=ablation.factor,
         command=made_by,
-        notes=f"{ablation.title} {setting(options, sweep)}",
+        notes=f"{ablation.title} {setting(options.agent, sweep)}\n\n{HOW_TO_READ}",
     )
     path.with_suffix(".md").write_text(table)
     figures.plot(rows, sweep, path.with_suffix(".png"), seeds="band")
@@ -201,19 +201,21 @@ def write(ablation: Ablation, options: Options, sweep: Sweep, made_by: str) -> s
     return table
 
 
-def setting(options: Options, sweep: Sweep) -> str:
-    """What all runs have in common, and how the numbers are to be read."""
+HOW_TO_READ = (
+    "Returns of the training episodes: mean +- standard error over seeds. The mean return is "
+    "the area under the curve, per environment step. Minutes are of one run."
+)
+
+
+def setting(agent: str, sweep: Sweep) -> str:
+    """What all runs have in common."""
     length = "" if sweep.env_steps is None else f", {sweep.env_steps:,} environment steps"
     preset = sweep.flags[sweep.flags.index("--preset") + 1]
-    return (
-        f"Agent {options.agent}, preset {preset} of {sweep.program.name}{length}; returns of "
-        "the training episodes. Mean +- standard error over seeds; the mean return is the area "
-        "under the curve per environment step."
-    )
+    return f"Agent {agent}, preset {preset} of {sweep.program.name}{length}."
 
 
-def command(options: Options, script: str) -> str:
-    """The command line of `options`, without what changes no number."""
+def command(options: Any, script: str) -> str:
+    """The command line of a dataclass of options, without what changes no number."""
     words = ["python", "experiments/ablations/" + pathlib.Path(script).name]
     silent = ("jobs", "runs", "results", "collect_only")
     for field in dataclasses.fields(options):

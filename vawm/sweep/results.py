@@ -145,14 +145,14 @@ def markdown(summaries: Sequence[Summary], *, factor: str, command: str, notes: 
     others = [name for name in summaries[0].last if name != "return"]
     names = [name.replace("_", " ") for name in others]
     heads = ["task", factor, "seeds", "last return", "best", "mean return", *names, "minutes"]
-    lines = [notes, "", _row(heads), _row(["---"] * len(heads))]
+    lines = [notes, "", line(heads), line(["---"] * len(heads))]
     for s in summaries:
         total = len(s.seeds) + len(s.missing)
         count = f"{total}" if not s.missing else f"**{len(s.seeds)} of {total}**"
         measured = [s.last["return"], s.best, s.area, *(s.last[name] for name in others)]
         minutes = f"{statistics.mean(s.minutes):.1f}" if s.minutes else "-"
         cells = [s.task, s.variant, count, *map(mean_and_error, measured), minutes]
-        lines.append(_row(cells))
+        lines.append(line(cells))
     lines.append("")
     for s in summaries:
         for seed, why in s.missing.items():
@@ -162,7 +162,8 @@ def markdown(summaries: Sequence[Summary], *, factor: str, command: str, notes: 
     return "\n".join([*lines, f"Made by `{command}`.", ""])
 
 
-def _row(cells: Sequence[str]) -> str:
+def line(cells: Sequence[str]) -> str:
+    """A line of a table in Markdown."""
     return "| " + " | ".join(cells) + " |"
 
 

@@ -1,0 +1,162 @@
+"""What a variant costs beside another: a table of time and memory, and its figure."""
+
+from __future__ import annotations
+
+import csv
+import pathlib
+import statistics
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from vawm import flags, overhead
+from vawm.envs.protocol import check_positive
+from vawm.overhead import Measured, percent_more, quartiles
+from vawm.sweep import ablation, runs
+from vawm.sweep.ablation import Ablation
+from vawm.sweep.results import line
+from vawm.sweep.runs import Run, Sweep
+
+Rows = list[dict[str, Any]]
+GIB = 2**30
+
+
+@dataclass(frozen=True)
+class Options:
+    """What is measured, and where it goes."""
+
+    scale: Literal["quick", "paper"] = "quick"
+    """quick: minutes on a CPU with 2 cores; paper: its tasks and presets, on a GPU"""
+    agent: str = "dreamerv3"
+    tasks: tuple[str, ...] = ()
+    """as many as are named; those of the scale if none"""
+    repeats: int = 20
+    """timed samples of each variant"""
+    results: pathlib.Path = pathlib.Path("experiments/results")
+
+
+def main(
+    compared: Ablation, argv: Sequence[str] | None, *, description: str | None, script: str
+) -> int:
+    """What a script does that measures two variants: the first, and what it is more than."""
+    default = Options(results=ablation.defaults(script).results)
+    options = flags.read(Options, argv, default=default, description=description)
+    check_positive("repeats", options.repeats)
+    given = {name: getattr(options, name) for name in ("scale", "agent", "tasks", "results")}
+    same = ablation.Options(**given)
+    sweep = ablation.make_sweep(compared, same, pathlib.Path(script).resolve().parents[1])
+    suite = ablation.scale_of(compared, same).suite
+    runs.check(sweep, suite)
+    runs.check_places(jobs=1, runs=None, results=options.results)
+    rows = []
+    for task in sweep.tasks:
+        owned = [Run(task, variant.name, sweep.seeds[0]) for variant in sweep.variants]
+        variants = [runs.flags(sweep, run) for run in owned]
+        rows += rows_of(owned, overhead.compare(suite, variants, repeats=options.repeats))
+    options.results.mkdir(parents=True, exist_ok=True)
+    path = options.results / ablation.result_name(compared, same)
+    notes = f"{compared.title} {ablation.setting(options.agent, sweep)}"
+    table = markdown(rows, notes=notes, command=ablation.command(options, script))
+    write_csv(rows, path.with_suffix(".csv"))
+    path.with_suffix(".md").write_text(table)
+    plot(rows, sweep, path.with_suffix(".png"))
+    print(table)
+    return 0
+
+
+def rows_of(owned: Sequence[Run], measured: Sequence[Measured]) -> Rows:
+    """A row per variant; what it takes more is more than the last one takes."""
+    rows, base = [], measured[-1]
+    for run, own in zip(owned, measured, strict=True):
+        first, third = quartiles(own.seconds)
+        more = percent_more(own.seconds, base.seconds)
+        low, high = quartiles(more)
+        rows.append(
+            {
+                "task": run.task,
+                "variant": run.variant,
+                "updates": own.updates,
+                "env_steps": own.env_steps,
+                "samples": len(own.seconds),
+                "seconds": statistics.median(own.seconds),
+                "seconds_first_quartile": first,
+                "seconds_third_quartile": third,
+                "overhead_percent": statistics.median(more),
+                "overhead_first_quartile": low,
+                "overhead_third_quartile": high,
+                "peak_gib": own.peak_bytes / GIB,
+                "more_memory_percent": 100 * (own.peak_bytes / base.peak_bytes - 1),
+                "run_hours": own.run_hours,
+                "compile_s": own.compile_s,
+            }
+        )
+    return rows
+
+
+HOW_TO_READ = (
+    "A sample is the smallest number of whole steps in which no part of an update is owed. "
+    "Medians, and in brackets quartiles over the samples; the overhead is that of a sample "
+    "over its neighbour of the other variant. Hours of a whole run follow from the median."
+)
+
+
+def markdown(rows: Rows, *, notes: str, command: str) -> str:
+    """The table, what it is of, and what made it."""
+    heads = ["task", "value alignment", "s per sample", "overhead", "peak memory", "hours"]
+    lines = [notes, "", HOW_TO_READ, "", line(heads), line(["---"] * len(heads))]
+    for row in rows:
+        values = [
+            f"{row['seconds']:.4g} ({row['seconds_first_quartile']:.4g} to "
+            f"{row['seconds_third_quartile']:.4g})",
+            f"{row['overhead_percent']:.1f} % ({row['overhead_first_quartile']:.1f} to "
+            f"{row['overhead_third_quartile']:.1f})",
+            f"{row['peak_gib']:.2f} GiB ({row['more_memory_percent']:+.1f} %)",
+            f"{row['run_hours']:.3g}",
+        ]
+        base = row["overhead_percent"] == 0.0 == row["more_memory_percent"]
+        if base:
+            values[1], values[2] = "-", f"{row['peak_gib']:.2f} GiB"
+        lines.append(line([row["task"], row["variant"], *values]))
+    sample = "; ".join(
+        f"{row['task']}: {row['updates']} updates and {row['env_steps']} environment steps a "
+        f"sample, {row['samples']} samples"
+        for row in {row["task"]: row for row in rows}.values()
+    )
+    return "\n".join([*lines, "", f"{sample}.", "", f"Made by `{command}`.", ""])
+
+
+def write_csv(rows: Rows, path: pathlib.Path) -> None:
+    """All that was measured, 6 digits of each number."""
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(rows[0])
+        for row in rows:
+            cells = row.values()
+            writer.writerow([f"{x:.6g}" if isinstance(x, float) else x for x in cells])
+
+
+def plot(rows: Rows, sweep: Sweep, path: pathlib.Path) -> None:
+    """Seconds of a sample, with quartiles, and peak memory: a group of bars per task."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, (time, memory) = plt.subplots(1, 2, figsize=(9, 3.2))
+    width, places = 0.8 / len(sweep.variants), range(len(sweep.tasks))
+    for number, variant in enumerate(sweep.variants):
+        own = [row for row in rows if row["variant"] == variant.name]
+        at = [place + number * width for place in places]
+        below = [row["seconds"] - row["seconds_first_quartile"] for row in own]
+        above = [row["seconds_third_quartile"] - row["seconds"] for row in own]
+        seconds = [row["seconds"] for row in own]
+        time.bar(at, seconds, width, yerr=(below, above), label=variant.name)
+        memory.bar(at, [row["peak_gib"] for row in own], width, label=variant.name)
+    for panel, what in ((time, "seconds of a sample"), (memory, "peak memory, GiB")):
+        middle = width * (len(sweep.variants) - 1) / 2
+        panel.set_xticks([place + middle for place in places], sweep.tasks)
+        panel.set(ylabel=what)
+    time.legend(title="value alignment")
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
