@@ -7,10 +7,10 @@ import sys
 
 import pytest
 
-from vawm import command_line, presets
+from vawm import command_line, overhead, presets
 from vawm import config as config_lib
 from vawm.errors import InvalidInput
-from vawm.sweep import ablation, runs
+from vawm.sweep import ablation, children, runs
 
 FOLDER = pathlib.Path(__file__).parents[1] / "experiments" / "ablations"
 PROGRAMS = FOLDER.parent
@@ -149,7 +149,8 @@ def test_bad_input_is_one_line_before_anything_starts(
     script, words, message, capsys, monkeypatch, tmp_path
 ):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(runs.Job, "__new__", None)
+    monkeypatch.setattr(children, "run", None)
+    monkeypatch.setattr(overhead, "compare", None)
     assert command_line.guard(lambda: SCRIPTS[script].main(words)) == 2
     output = capsys.readouterr()
     assert output.err.startswith(f"error: {message}")
