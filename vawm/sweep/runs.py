@@ -106,8 +106,10 @@ def finished(sweep: Sweep, run: Run) -> bool:
 
 def env_steps(sweep: Sweep, run: Run) -> int | None:
     """How long the run is to be; None where only its preset knows, and it was not begun."""
+    if sweep.env_steps is not None:
+        return sweep.env_steps
     config = rundir.read_config(folder(sweep, run))
-    return sweep.env_steps or (config.env_steps if config else None)
+    return config.env_steps if config else None
 
 
 def unfinished_jobs(sweep: Sweep) -> list[Job]:
