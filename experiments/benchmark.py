@@ -45,7 +45,7 @@ from vawm.errors import InvalidInput
 from vawm.learn import Draw
 from vawm.learner import init_learner, make_update
 from vawm.overhead import peak_process_bytes, percent_more, quartiles
-from vawm.presets import PAPER, STORM
+from vawm.presets import PAPER, STORM, vagram
 from vawm.types import Batch, EnvSpec, Trajectory, image, vector
 from vawm.world_model.codecs import check_image_size
 
@@ -54,10 +54,10 @@ from vawm.world_model.codecs import check_image_size
 class Benchmark:
     """Time the update, its compilation, and stepping environments with the policy."""
 
-    agent: Literal["dreamerv3", "storm"] = "dreamerv3"
+    agent: Literal["dreamerv3", "storm", "vagram"] = "dreamerv3"
     """storm: Table 14, imagination from 1024 contexts of their own"""
     size: str | None = None
-    """model size; 1m for dreamerv3, 16m for storm if not given"""
+    """model size; 16m for storm, 1m for the others if not given"""
     batch_size: int = 16
     batch_length: int = 64
     obs: Literal["vector", "pixels"] = "vector"
@@ -99,11 +99,11 @@ def check(options: Benchmark) -> None:
 
 
 def size_of(options: Benchmark) -> str:
-    return options.size or {"dreamerv3": "1m", "storm": "16m"}[options.agent]
+    return options.size or ("16m" if options.agent == "storm" else "1m")
 
 
 def make_config(options: Benchmark) -> Config:
-    paper = {"dreamerv3": PAPER, "storm": STORM}[options.agent]
+    paper = {"dreamerv3": PAPER, "storm": STORM, "vagram": vagram(PAPER)}[options.agent]
     return dataclasses.replace(
         with_size(paper, size_of(options)),
         compute_dtype=options.compute_dtype,

@@ -48,7 +48,7 @@ class Options:
         "dmc_proprio"
     )
     """the program that trains"""
-    agent: Literal["dreamerv3", "storm"] = "dreamerv3"
+    agent: Literal["dreamerv3", "storm", "vagram"] = "dreamerv3"
     tasks: tuple[str, ...] = ()
     """as many as are named; the usual ones of the experiment if none"""
     seeds: tuple[int, ...] = (0, 1, 2)
