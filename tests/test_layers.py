@@ -77,6 +77,7 @@ LAYERS = {
     },
 }
 HOST = {
+    "analysis",
     "checkpoint",
     "command_line",
     "display",

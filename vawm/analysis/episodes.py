@@ -1,0 +1,196 @@
+"""Whole episodes of a trained policy, step by step, with what its world model remembers.
+
+As in `vawm.play`, which episodes there are is fixed before the first begins. Environments are
+those of the run's own config, so rewards and ends are those that the critic was trained on.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vawm import evaluate, suites
+from vawm.agent import Agent, make_agent
+from vawm.config import HostEnvConfig
+from vawm.envs.protocol import Environment, HostEnvironment
+from vawm.errors import InvalidInput
+from vawm.play import FRESH, How
+from vawm.policy import Policy
+from vawm.types import Batch, Key, Params, PyTree, TimeStep, Trajectory
+
+
+class Episodes(NamedTuple):
+    """E episodes side by side, each from its first step on.
+
+    Steps from `length` on are of no episode that was asked for: they only complete the shape.
+
+    Attributes:
+      trajectory: `[E, T, ...]`.
+      memory: `[E, T, ...]` what replay would keep beside every step, from which a `Batch`
+        begins; `()` for nothing.
+      length: `[E]` int32, steps, the first and the last of the episode among them.
+    """
+
+    trajectory: Trajectory
+    memory: PyTree
+    length: Any  # of jax or of numpy, as all leaves
+
+    @property
+    def returns(self) -> np.ndarray:
+        """`[E]` undiscounted."""
+        reward, length = np.asarray(self.trajectory.reward), np.asarray(self.length)
+        inside = np.arange(reward.shape[1]) < length[:, None]
+        return np.where(inside, reward, 0.0).sum(1)
+
+
+def record(policy: Policy, *, episodes: int, seed: int, how: How = "sample") -> Episodes:
+    """Plays `episodes` whole episodes in the environments of the policy's own config.
+
+    Raises:
+      InvalidInput: a number of episodes that is not positive, or an impossible seed.
+      EnvironmentFailure: an environment on the host failed.
+    """
+    evaluate.check(episodes, seed)
+    config = policy.config
+    if not isinstance(config.env, HostEnvConfig):
+        env = suites.make(dataclasses.replace(config, num_envs=episodes))
+        return record_in(env, policy, episodes=episodes, seed=seed, how=how)
+    config = dataclasses.replace(
+        config,
+        num_envs=min(episodes, evaluate.AT_ONCE),
+        env=dataclasses.replace(config.env, on_failure="raise"),
+    )
+    host = suites.make(config)
+    assert not isinstance(host, Environment)
+    with contextlib.closing(host):
+        return record_in(host, policy, episodes=episodes, seed=seed, how=how)
+
+
+def record_in(
+    env: Environment | HostEnvironment,
+    policy: Policy,
+    *,
+    episodes: int,
+    seed: int,
+    how: How = "sample",
+) -> Episodes:
+    """As `record`, in any environments; a jittable one needs `num_envs == episodes`.
+
+    Raises:
+      InvalidInput: also for environments of another kind than the policy's, and for a jittable
+        one whose episodes have no fixed length.
+    """
+    evaluate.check(episodes, seed)
+    evaluate.check_env(policy, env)
+    agent = make_agent(policy.config, policy.spec)
+    if not isinstance(env, Environment):
+        return on_host(env, policy, agent, episodes=episodes, seed=seed, how=how)
+    if env.spec.num_envs != episodes:
+        remedy = f"the environments are {env.spec.num_envs}, one for each; use that"
+        raise InvalidInput("episodes", episodes, remedy)
+    if env.spec.episode_length is None:
+        raise InvalidInput("env", env.spec.task, "has to say how long an episode can be")
+
+    def play(params: Params, state: PyTree, key: Key) -> Episodes:
+        own = policy._replace(params=params, state=state)
+        return on_device(env, own, agent, key, how=how)
+
+    return jax.jit(play)(policy.params, policy.state, jax.random.key(seed))
+
+
+def on_device(
+    env: Environment, policy: Policy, agent: Agent, key: Key, *, how: How = "sample"
+) -> Episodes:
+    """The first episode in each of N environments; can be jitted."""
+    assert env.spec.episode_length is not None
+    key_reset, key_act = jax.random.split(key)
+
+    def step(loop: tuple[Any, ...], key: Key):
+        env_state, carry = loop[0], loop[2]
+        timestep: TimeStep = loop[1]
+        carry, action = policy.act(key, carry, timestep, how)
+        recorded = Trajectory(*timestep, action=action), agent.world_model.memory(carry.memory)
+        return (*env.step(env_state, action), carry), recorded
+
+    first = (*env.reset(key_reset), policy.initial(env.spec.num_envs))
+    keys = jax.random.split(key_act, env.spec.episode_length + 1)
+    _, recorded = jax.lax.scan(step, first, keys)
+    trajectory, memory = jax.tree.map(lambda x: x.swapaxes(0, 1), recorded)
+    length = 1 + jnp.argmax(trajectory.is_last, axis=1)
+    return Episodes(trajectory, memory, length.astype(jnp.int32))
+
+
+def on_host(
+    env: HostEnvironment,
+    policy: Policy,
+    agent: Agent,
+    *,
+    episodes: int,
+    seed: int,
+    how: How = "sample",
+) -> Episodes:
+    """`episodes` whole episodes, a share in each of N environments, in the order of these."""
+    num_envs = env.spec.num_envs
+    share = [len(range(i, episodes, num_envs)) for i in range(num_envs)]
+    whole: list[list[list[PyTree]]] = [[] for _ in range(num_envs)]
+    running: list[list[PyTree]] = [[] for _ in range(num_envs)]
+    carry, key = policy.initial(num_envs), jax.random.key(seed)
+    timestep = env.reset(FRESH + seed)
+    while any(len(own) < wanted for own, wanted in zip(whole, share, strict=True)):
+        key, key_act = jax.random.split(key)
+        carry, action = policy.act(key_act, carry, timestep, how)
+        trajectory = Trajectory(*timestep, action=action)
+        remembered = agent.world_model.memory(carry.memory)
+        # Copies: the environment may write over its own arrays.
+        kept = jax.tree.map(np.array, (trajectory, remembered))
+        env.send(kept[0].action)
+        for i in range(num_envs):
+            if len(whole[i]) < share[i]:
+                running[i].append(jax.tree.map(lambda x, i=i: x[i], kept))
+                if kept[0].is_last[i]:
+                    whole[i].append(running[i])
+                    running[i] = []
+        timestep = env.receive()
+    return join([episode for own in whole for episode in own])
+
+
+def join(episodes: Sequence[Sequence[PyTree]]) -> Episodes:
+    """Lists of `(step of a trajectory, memory)`; short ones repeat their last step."""
+    length = max(map(len, episodes))
+    rows = [
+        jax.tree.map(lambda *x: np.stack(x), *episode, *[episode[-1]] * (length - len(episode)))
+        for episode in episodes
+    ]
+    trajectory, memory = jax.tree.map(lambda *x: np.stack(x), *rows)
+    return Episodes(trajectory, memory, np.array([len(e) for e in episodes], np.int32))
+
+
+def select(episodes: Episodes, index: int) -> Episodes:
+    """One of them, with its leading dim."""
+    return jax.tree.map(lambda x: x[index : index + 1], episodes)
+
+
+def windows(episodes: Episodes, row: Any, start: Any, *, length: int) -> Batch:
+    """`[N, length, ...]` steps of the episodes `row`, from their steps `start` on.
+
+    The first step only gives context. What lies beyond the end of the record is its last step.
+
+    Args:
+      episodes: the record.
+      row: `[N]` int, which episode.
+      start: `[N]` int, at which step the window begins.
+      length: steps of a window.
+    """
+    row, start = jnp.asarray(row), jnp.asarray(start)
+    last = episodes.trajectory.reward.shape[1] - 1
+    time = jnp.minimum(start[:, None] + jnp.arange(length)[None], last)
+    return Batch(
+        jax.tree.map(lambda x: jnp.asarray(x)[row[:, None], time], episodes.trajectory),
+        jax.tree.map(lambda x: jnp.asarray(x)[row, start], episodes.memory),
+    )

@@ -1,0 +1,127 @@
+"""The states of an episode as a world model infers them, and imagination from every one.
+
+Two kinds of world models are told apart by their protocol. One that has `starts` can imagine
+from any state that it inferred: all steps of the episode but the first are one sequence. One
+that has not needs the steps before: every state is inferred from a window of `context` steps
+that ends there, so the first `context - 1` steps have none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from vawm.agent import Agent
+from vawm.analysis.episodes import Episodes, windows
+from vawm.config import Config, StormConfig
+from vawm.envs.protocol import check_positive
+from vawm.errors import InvalidInput
+from vawm.types import Array, Batch, Key, Latent, Params, PyTree, Trajectory
+from vawm.world_model.protocol import Imagination
+
+
+class Inferred(NamedTuple):
+    """The last N steps of a record of one episode, in order.
+
+    Attributes:
+      latent: `[N, ...]` s_t, its z_t drawn from the posterior.
+      post_logits: `[N, S, K]` of that posterior, before unimix; None where the protocol does
+        not give them.
+      ahead: where imagination stands after a_t: s~_{t+1}, its z drawn from the prior.
+    """
+
+    latent: Latent
+    post_logits: Array | None
+    ahead: Imagination
+
+
+Infer = Callable[[Params, PyTree, Key, Episodes], Inferred]
+
+
+def make_infer(agent: Agent, *, context: int, horizon: int) -> Infer:
+    """Build `infer(params, state, key, episode) -> Inferred`; `episode` has E = 1.
+
+    No gradient is stopped here.
+
+    Args:
+      agent: the agent.
+      context: steps of a window, where the world model needs one; at least 2.
+      horizon: steps that can be imagined after `ahead`.
+    """
+    world_model = agent.world_model
+
+    def from_states(params: Params, state: PyTree, key: Key, episode: Episodes) -> Inferred:
+        model, starts = params.world_model, world_model.starts
+        assert starts is not None
+        key_explain, key_imagine = jax.random.split(key)
+        whole = windows(episode, [0], [0], length=episode.trajectory.reward.shape[1])
+        inference = world_model.explain(model, state, key_explain, whole)[0].inference
+        carry, latent = starts(model, state, inference)
+        action = whole.trajectory.action[0, 1:]
+        ahead = world_model.imagine(model, state, key_imagine, carry, action)
+        return Inferred(latent, inference.post_logits[0], ahead)
+
+    def from_windows(params: Params, state: PyTree, key: Key, episode: Episodes) -> Inferred:
+        start = jnp.arange(episode.trajectory.reward.shape[1] - context + 1)
+        batch = windows(episode, jnp.zeros_like(start), start, length=context)
+        inferred, ahead = world_model.follow(
+            params.world_model, state, key, batch, horizon=horizon
+        )
+        return Inferred(jax.tree.map(lambda x: x[:, -1], inferred), None, ahead)
+
+    return from_windows if world_model.starts is None else from_states
+
+
+def make_prior(agent: Agent) -> Callable[..., Array] | None:
+    """Build `prior(params, state, key, latent, action) -> logits [N, S, K]`, before unimix.
+
+    They are of p(z_{t+1} | h_{t+1}) after `latent` and `action`: those by which `explain` would
+    judge a sequence that begins with this state. None for a world model whose states are not
+    all that it needs.
+    """
+    world_model, spec = agent.world_model, agent.spec
+    if world_model.starts is None:
+        return None
+
+    def prior(params: Params, state: PyTree, key: Key, latent: Latent, action: Array) -> Array:
+        size = action.shape[0]
+
+        def blank(leaf):
+            return jnp.zeros((size, 2, *leaf.shape), leaf.dtype)
+
+        flag = jnp.zeros((size, 2), bool)
+        steps = Trajectory(
+            obs=jax.tree.map(blank, spec.obs),  # the prior never sees it
+            reward=jnp.zeros((size, 2)),
+            is_first=flag,
+            is_last=flag,
+            is_terminal=flag,
+            action=jnp.stack([action, jnp.zeros_like(action)], axis=1),
+        )
+        batch = Batch(steps, world_model.memory(latent))
+        explanation, _ = world_model.explain(params.world_model, state, key, batch)
+        return explanation.inference.prior_logits[:, 0]
+
+    return prior
+
+
+def check(config: Config, *, context: int, depth: int) -> None:
+    """Refuses what no world model, or not this one, can imagine.
+
+    Raises:
+      InvalidInput: names the number and the remedy.
+    """
+    check_positive("depth", depth)
+    check_positive("context", context)
+    if context < 2:
+        raise InvalidInput("context", context, "use at least 2: the first step infers nothing")
+    seen = config.replay.batch_length
+    if not isinstance(config.world_model, StormConfig) or context + depth <= seen:
+        return
+    saw = f"training saw {seen} positions"
+    if context >= seen:
+        raise InvalidInput("context", context, f"use less than {seen}: {saw}")
+    raise InvalidInput("depth", depth, f"use at most {seen - context} after the context: {saw}")

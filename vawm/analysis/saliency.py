@@ -1,0 +1,144 @@
+"""Which part of an observation a latent, and the value of it, depends on: Figs 3 and 13.
+
+Three maps of the shape of the observation, at an inferred state s = (h, z):
+
+    sensitivity      sqrt(sum_j (d o_i / d z_j)^2)        how strongly o_i moves with z
+    value            |sum_j d o_i / d z_j * dV / d z_j|   how o_i moves where V rises
+    observed         |dV / d x_i|                         what of the input V depends on
+
+o is the decoded observation at (h, z), x the observation that z was inferred from. The paper
+calls the second one value-gradient weighting and gives no formula: pulling dV/dz back through
+the decoder's sensitivity is our reading.
+
+For the first two, decoder and critic are differentiated at the drawn one-hot z as if it were
+any vector, h held fixed. The third goes through encoder and posterior of the last step, and
+through the draw of z by the straight-through gradient, that of the probabilities; h does not
+depend on x. Where z is not drawn, it is the gradient itself.
+
+V is the critic's mean, or symlog of it. Decoded images are in [0, 1], decoded vectors in
+symlog. Of the colours of a pixel a map holds the Euclidean norm, which for a single one is the
+absolute value.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vawm import transforms
+from vawm.agent import Agent, make_agent
+from vawm.analysis import inference
+from vawm.analysis.episodes import Episodes, windows
+from vawm.policy import Policy
+from vawm.types import Array, Batch, Key, Latent, Params, PyTree, is_image
+
+Unit = Literal["symlog", "raw"]
+MAPS = ("sensitivity", "value", "observed")
+
+
+class Saliency(NamedTuple):
+    """Maps of F states; every field but the last has the tree of an observation.
+
+    Images have `[F, H, W]`, vectors `[F, D]`, and `decoded` is as the decoder tells it.
+    """
+
+    decoded: PyTree
+    sensitivity: PyTree
+    value: PyTree
+    observed: PyTree  # None in the place of images
+    states: Array  # [F] V of the states
+
+
+def make_saliency(
+    agent: Agent, *, unit: Unit = "symlog", probes: int = 64
+) -> Callable[[Params, PyTree, Key, Batch], Saliency]:
+    """Build `saliency(params, state, key, batch) -> Saliency`, of the last step of each row.
+
+    Args:
+      agent: the agent.
+      unit: of V.
+      probes: random signs v by which the squared sensitivity is estimated, as the mean of
+        (J v)^2, J = d o / d z; unbiased, with a relative standard error of at most
+        sqrt(2 / probes) for each entry. No Jacobian is built.
+    """
+    world_model, critic = agent.world_model, agent.critic
+
+    def value(params: Params, latent: Latent) -> Array:
+        mean = critic.code.mean(critic.logits(params.critic, latent))
+        return transforms.symlog(mean) if unit == "symlog" else mean
+
+    def saliency(params: Params, state: PyTree, key: Key, batch: Batch) -> Saliency:
+        key_follow, key_probe = jax.random.split(key)
+        model = params.world_model
+
+        def infer(obs: PyTree) -> Latent:
+            """The state after the last step, had `obs` been seen there."""
+            joined = jax.tree.map(
+                lambda past, last: jnp.concatenate([past[:, :-1], last[:, None]], axis=1),
+                batch.trajectory.obs,
+                obs,
+            )
+            seen = batch._replace(trajectory=batch.trajectory._replace(obs=joined))
+            inferred, _ = world_model.follow(model, state, key_follow, seen, horizon=1)
+            return jax.tree.map(lambda x: x[:, -1], inferred)
+
+        last = jax.tree.map(lambda x: x[:, -1], batch.trajectory.obs)
+        deter, stoch = infer(last)
+
+        def decode(stoch: Array) -> PyTree:
+            return world_model.predict(model, state, Latent(deter, stoch)).obs
+
+        def push(tangent: Array) -> PyTree:
+            return jax.jvp(decode, (stoch,), (tangent,))[1]
+
+        def probe(total: PyTree, key: Key):
+            sign = jax.random.rademacher(key, stoch.shape, stoch.dtype)
+            return jax.tree.map(lambda t, x: t + jnp.square(x), total, push(sign)), None
+
+        # Rows do not meet in any network, so the gradient of the sum is that of each.
+        slope = jax.grad(lambda z: value(params, Latent(deter, z)).sum())(stoch)
+        decoded = decode(stoch)
+        zero = jax.tree.map(jnp.zeros_like, decoded)
+        squares, _ = jax.lax.scan(probe, zero, jax.random.split(key_probe, probes))
+        return Saliency(
+            decoded=decoded,
+            sensitivity=norms(jax.tree.map(lambda x: jnp.sqrt(x / probes), squares), last),
+            value=norms(push(slope), last),
+            observed=norms(gradient(lambda obs: value(params, infer(obs)).sum(), last), last),
+            states=value(params, Latent(deter, stoch)),
+        )
+
+    return saliency
+
+
+def gradient(function: Callable[[PyTree], Array], obs: PyTree) -> PyTree:
+    """Of a scalar `function` with respect to the vectors in `obs`; None for images.
+
+    Bytes have no gradient.
+    """
+    leaves, tree = jax.tree.flatten(obs)
+    places = [i for i, leaf in enumerate(leaves) if not is_image(leaf)]
+
+    def of_vectors(vectors: list[Array]) -> Array:
+        filled = dict(enumerate(leaves)) | dict(zip(places, vectors, strict=True))
+        return function(jax.tree.unflatten(tree, list(filled.values())))
+
+    slopes = dict(zip(places, jax.grad(of_vectors)([leaves[i] for i in places]), strict=True))
+    return jax.tree.unflatten(tree, [slopes.get(i) for i in range(len(leaves))])
+
+
+def norms(changes: PyTree, obs: PyTree) -> PyTree:
+    """Euclidean norm over the colours of images, absolute value for vectors; None stays."""
+
+    def norm(like: Array, change: Array | None) -> Array | None:
+        if change is None:
+            return None
+        if is_image(like):
+            return jnp.sqrt(jnp.square(change).sum(-1))
+        return jnp.abs(change)
+
+    return jax.tree.map(norm, obs, changes, is_leaf=lambda x: x is None)

@@ -1,0 +1,152 @@
+"""Imagined trajectories against the truth, Figs 3 and 7.
+
+After a context that is observed, the recorded actions are followed open loop: the world model
+never looks again, and its decoder tells what it expects.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from vawm import video
+from vawm.agent import make_agent
+from vawm.analysis import inference
+from vawm.analysis.episodes import Episodes, windows
+from vawm.open_loop import make_open_loop
+from vawm.policy import Policy
+from vawm.transforms import symlog
+from vawm.types import PyTree, is_image
+
+
+class Trajectories(NamedTuple):
+    """R windows of T steps, `context` of them observed; numpy.
+
+    Attributes:
+      start: `[R]` the step of its episode that each window begins with.
+      truth: as observed, `[R, T, ...]`.
+      predicted: as decoded: symlog for vectors, [0, 1] for images.
+      inside: `[R, T]` bool, whether the step is one of the episode.
+      context: steps that were observed.
+    """
+
+    start: np.ndarray
+    truth: PyTree
+    predicted: PyTree
+    inside: np.ndarray
+    context: int
+
+
+def imagine(
+    policy: Policy,
+    episodes: Episodes,
+    *,
+    context: int,
+    depth: int,
+    seed: int,
+    at_most: int = 4,
+) -> Trajectories:
+    """Windows of `context + depth` steps, one from each of the first `at_most` episodes.
+
+    Where in its episode a window lies is drawn by `seed`, among the places where it fits; in an
+    episode shorter than that it begins with the first step. The step before the window gives
+    context only, as in every `Batch`.
+
+    Raises:
+      InvalidInput: a depth or a context that cannot be imagined, see `inference.check`.
+    """
+    inference.check(policy.config, context=context, depth=depth)
+    agent = make_agent(policy.config, policy.spec)
+    length = np.asarray(episodes.length)[:at_most]
+    room = np.maximum(length - (context + depth + 1), 0)
+    start = np.random.default_rng(seed).integers(room + 1)
+    batch = windows(episodes, np.arange(len(start)), start, length=context + depth + 1)
+    open_loop = jax.jit(make_open_loop(agent, context=context))
+    predicted = open_loop(policy.params, policy.state, jax.random.key(seed), batch).predicted
+    time = start[:, None] + np.arange(1, context + depth + 1)
+    return Trajectories(
+        start=start + 1,
+        truth=jax.device_get(jax.tree.map(lambda x: x[:, 1:], batch.trajectory.obs)),
+        predicted=jax.device_get(predicted),
+        inside=time < length[:, None],
+        context=context,
+    )
+
+
+def errors(trajectories: Trajectories) -> dict[str, np.ndarray]:
+    """Mean squared error by step, "image" and "vector", each `[T]` where there are such.
+
+    In the decoder's units, over pixels or coordinates of the windows that are still inside of
+    their episode; NaN where none is.
+    """
+    kinds: dict[str, list[np.ndarray]] = {}
+    pairs = zip(
+        jax.tree.leaves(trajectories.truth),
+        jax.tree.leaves(trajectories.predicted),
+        strict=True,
+    )
+    for truth, guess in pairs:
+        target = truth / 255.0 if is_image(truth) else np.asarray(symlog(truth))
+        square = np.square(np.asarray(guess, np.float64) - target)
+        kind = "image" if is_image(truth) else "vector"
+        kinds.setdefault(kind, []).append(square.reshape(*square.shape[:2], -1))
+    inside = trajectories.inside
+    result = {}
+    for kind, squares in kinds.items():
+        error = np.concatenate(squares, -1).mean(-1)
+        count = inside.sum(0)
+        total = np.where(inside, error, 0.0).sum(0)
+        result[kind] = np.divide(
+            total, count, out=np.full(total.shape, np.nan), where=count > 0
+        )
+    return result
+
+
+def rows(name: str, trajectories: Trajectories) -> list[dict[str, Any]]:
+    """For a CSV: one row per step; steps that were observed have a depth of 0 and below."""
+    return [
+        {
+            "run": name,
+            "kind": kind,
+            "depth": t + 1 - trajectories.context,
+            "squared_error": float(error[t]),
+            "windows": int(trajectories.inside[:, t].sum()),
+        }
+        for kind, error in errors(trajectories).items()
+        for t in range(len(error))
+    ]
+
+
+def has_images(trajectories: Trajectories) -> bool:
+    return any(is_image(leaf) for leaf in jax.tree.leaves(trajectories.truth))
+
+
+def film(trajectories: Trajectories) -> np.ndarray:
+    """`[T, H, W, 3]` uint8: truth, imagination and difference one above the other.
+
+    Windows lie side by side; the border is that of `video.open_loop_video`.
+    """
+    shown = video.open_loop_video(
+        trajectories.truth,
+        trajectories.predicted,
+        trajectories.inside,
+        context=trajectories.context,
+    )
+    return shown.frames
+
+
+def vectors(trajectories: Trajectories) -> tuple[np.ndarray, np.ndarray]:
+    """Truth and prediction of all coordinates in the units of `symlog`, both `[R, T, D]`."""
+    pairs = [
+        (np.asarray(symlog(truth)), np.asarray(guess))
+        for truth, guess in zip(
+            jax.tree.leaves(trajectories.truth),
+            jax.tree.leaves(trajectories.predicted),
+            strict=True,
+        )
+        if not is_image(truth)
+    ]
+    truths, guesses = zip(*pairs, strict=True)
+    return np.concatenate(truths, -1), np.concatenate(guesses, -1)

@@ -1,0 +1,317 @@
+"""Value errors by depth of imagination: how far imagined states mislead the critic.
+
+From every state s_t that was inferred in a recorded episode, the world model imagines along the
+recorded actions, k = 0..K steps, with its prior. What is read from s~_{t+k} is compared with
+what is read from the inferred s_{t+k}, and with what truly happened:
+
+    value        |V(s~_{t+k}) - V(s_{t+k})|
+    return       |V(s~_{t+k}) - G_{t+k}|,  G_t = sum_{i >= 1} gamma^{i-1} r_{t+i}
+    bootstrapped the same, with gamma^{T-t} V(s_T) added to G_t where s_T is not terminal
+    reward       |R(s~_{t+k}) - r_{t+k}|, R the mean of the reward head
+    value_kl     KL[V(s_{t+k}) || V(s~_{t+k})] in nats, of the critic's distributions
+    latent_kl    KL[q(z_{t+k} | h_{t+k}, o_{t+k}) || p(z | h~_{t+k})] in nats, summed over the
+                 categoricals, with unimix
+    distance     half of |z~ - z|^2, mean over the categoricals: for one-hot z the share of them
+                 that differ
+
+At depth 0 the imagined state is the inferred one. Only depths inside the same episode count,
+for the returns only states that an action left from, T being the step of the last. V is the
+online critic's mean, in units of the reward. An episode cut by a time limit misses what would
+have come: "return" leaves that out of G, "bootstrapped" takes the critic's word for it.
+
+Source: our reading of Figs 3 and 7, which show imagined trajectories as pictures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vawm import transforms
+from vawm.agent import Agent, make_agent
+from vawm.analysis.episodes import Episodes, select
+from vawm.analysis.inference import check, make_infer, make_prior
+from vawm.config import Config
+from vawm.objective import discount_of
+from vawm.policy import Policy
+from vawm.types import Array, Key, Latent, Params, PyTree
+
+
+class Rollouts(NamedTuple):
+    """What imagination says, `[N, K + 1]`: entry (i, k) is k steps after the i-th state."""
+
+    value: Any  # of jax or of numpy, like the others
+    reward: Any
+    value_kl: Any
+    latent_kl: Any  # NaN where the world model's protocol does not give logits
+    distance: Any
+
+
+def make_rollouts(
+    agent: Agent, config: Config, *, context: int, depth: int
+) -> Callable[[Params, PyTree, Key, Episodes], Rollouts]:
+    """Build `rollouts(params, state, key, episode) -> Rollouts`; `episode` has E = 1.
+
+    The N states are the last N steps of the record; depths beyond it repeat its last step and
+    mean nothing. No gradient is stopped.
+    """
+    world_model, critic = agent.world_model, agent.critic
+    infer = make_infer(agent, context=context, horizon=depth)
+    prior = make_prior(agent)
+    model = config.world_model
+    reward_code = transforms.make_two_hot(model.bins, model.bin_spacing)
+
+    def latent_kl(post_logits: PyTree, prior_logits: Array) -> Array:
+        pair = post_logits, prior_logits
+        mixed = [transforms.unimix_logits(logits, model.unimix) for logits in pair]
+        return transforms.categorical_kl(*mixed).sum(-1)
+
+    def rollouts(params: Params, state: PyTree, key: Key, episode: Episodes) -> Rollouts:
+        key_infer, key_prior, key_imagine = jax.random.split(key, 3)
+        inferred = infer(params, state, key_infer, episode)
+        count = inferred.latent.deter.shape[0]
+        action = episode.trajectory.action[0, -count:]
+        value_logits = critic.logits(params.critic, inferred.latent)
+
+        def later(x: PyTree, k: Array | int) -> PyTree:
+            at = jnp.minimum(jnp.arange(count) + k, count - 1)
+            return jax.tree.map(lambda leaf: leaf[at], x)
+
+        def prior_logits(key: Key, latent: Latent, action: Array) -> Array | None:
+            if prior is None or inferred.post_logits is None:
+                return None
+            return prior(params, state, key, latent, action)
+
+        def look(latent: Latent, logits: Array | None, k: Array | int) -> Rollouts:
+            here = critic.logits(params.critic, latent)
+            reward = world_model.predict(params.world_model, state, latent).reward
+            gap = jnp.square(latent.stoch - later(inferred.latent.stoch, k))
+            value = critic.code.mean(here)
+            latents = jnp.full_like(value, jnp.nan)
+            if logits is not None:
+                latents = latent_kl(later(inferred.post_logits, k), logits)
+            return Rollouts(
+                value=value,
+                reward=reward_code.mean(reward),
+                value_kl=transforms.categorical_kl(later(value_logits, k), here),
+                latent_kl=latents,
+                distance=gap.sum(-1).mean(-1) / 2,
+            )
+
+        def deeper(reached: PyTree, inputs: PyTree):
+            carry, latent, logits = reached
+            k, key_prior, key_imagine = inputs
+            seen = look(latent, logits, k)
+            leaves = later(action, k)
+            logits = prior_logits(key_prior, latent, leaves)
+            carry, latent = world_model.imagine(
+                params.world_model, state, key_imagine, carry, leaves
+            )
+            return (carry, latent, logits), seen
+
+        key_prior, key_first = jax.random.split(key_prior)
+        first: PyTree = (*inferred.ahead, prior_logits(key_first, inferred.latent, action))
+        keys = [jax.random.split(k, depth) for k in (key_prior, key_imagine)]
+        inputs: PyTree = (jnp.arange(1, depth + 1), *keys)
+        _, imagined = jax.lax.scan(deeper, first, inputs)
+        root = look(inferred.latent, inferred.post_logits, 0)
+        return jax.tree.map(
+            lambda a, b: jnp.concatenate([a[:, None], b.swapaxes(0, 1)], axis=1), root, imagined
+        )
+
+    return rollouts
+
+
+MEASURES = (
+    "value",
+    "return",
+    "bootstrapped",
+    "reward",
+    "value_kl",
+    "latent_kl",
+    "distance",
+)
+
+
+class ErrorByDepth(NamedTuple):
+    """Errors of E episodes at depths 0..K; the episodes are the units of the standard error.
+
+    Attributes:
+      states: measure -> `[E, K + 1]` states of the episode that reach so deep within it.
+      errors: measure -> `[E, K + 1]`, mean over these states; NaN where there is none.
+    """
+
+    states: dict[str, np.ndarray]
+    errors: dict[str, np.ndarray]
+
+    def mean(self, measure: str) -> np.ndarray:
+        """`[K + 1]` over the episodes that reach so deep; NaN where none does."""
+        return mean_and_error(self.errors[measure])[0]
+
+    def standard_error(self, measure: str) -> np.ndarray:
+        """`[K + 1]` of `mean`; NaN below two episodes."""
+        return mean_and_error(self.errors[measure])[1]
+
+
+class Report(NamedTuple):
+    """Of one run.
+
+    Attributes:
+      by_depth: the errors.
+      first: the step of an episode that the first state inferred belongs to.
+      value: `[E, N]` V of the inferred states s_first, s_{first + 1}, ...
+      imagined: `[E, N, K + 1]` values along imagined rollouts.
+      returns: `[E, N]` G there, without bootstrap.
+      counts: `[E, N]` bool, whether an action left from there.
+    """
+
+    by_depth: ErrorByDepth
+    first: int
+    value: np.ndarray
+    imagined: np.ndarray
+    returns: np.ndarray
+    counts: np.ndarray
+
+
+def report(
+    policy: Policy, episodes: Episodes, *, context: int, depth: int, seed: int
+) -> Report:
+    """Rolls every episode out and compares; one compiled program for all of them.
+
+    Raises:
+      InvalidInput: a depth or a context that cannot be imagined, see `inference.check`.
+    """
+    check(policy.config, context=context, depth=depth)
+    agent = make_agent(policy.config, policy.spec)
+    rollouts = jax.jit(make_rollouts(agent, policy.config, context=context, depth=depth))
+    keys = jax.random.split(jax.random.key(seed), len(episodes.length))
+    rolled = [
+        jax.device_get(rollouts(policy.params, policy.state, key, select(episodes, i)))
+        for i, key in enumerate(keys)
+    ]
+    return compare(
+        jax.tree.map(lambda *x: np.stack(x).astype(np.float64), *rolled),
+        jax.device_get(episodes),
+        discount=discount_of(policy.config),
+    )
+
+
+def compare(rollouts: Rollouts, episodes: Episodes, *, discount: float) -> Report:
+    """What the rollouts `[E, N, K + 1]` of the last N steps of a record are worth.
+
+    Plain numpy in float64; the equations are those of the module.
+    """
+    steps, length = episodes.trajectory, np.asarray(episodes.length)
+    _, count, depths = rollouts.value.shape
+    first = steps.reward.shape[1] - count
+    time, depth = np.arange(first, first + count)[:, None], np.arange(depths)
+    reached = time + depth < length[:, None, None]  # [E, N, K + 1]
+    left = time + depth < length[:, None, None] - 1
+    at = np.minimum(np.arange(count)[:, None] + depth, count - 1)
+
+    rows, last = np.arange(len(length)), length - 1
+    final = rollouts.value[rows, np.maximum(last - first, 0), 0]
+    tail = np.where(np.asarray(steps.is_terminal)[rows, last], 0.0, final)
+    truth = {
+        name: discounted_returns(steps.reward, length, end, discount=discount)[:, first:]
+        for name, end in [("return", np.zeros_like(tail)), ("bootstrapped", tail)]
+    }
+    value, reward = rollouts.value[..., 0], np.asarray(steps.reward, np.float64)[:, first:]
+    errors = {
+        "value": np.abs(rollouts.value - value[:, at]),
+        "return": np.abs(rollouts.value - truth["return"][:, at]),
+        "bootstrapped": np.abs(rollouts.value - truth["bootstrapped"][:, at]),
+        "reward": np.abs(rollouts.reward - reward[:, at]),
+        "value_kl": rollouts.value_kl,
+        "latent_kl": rollouts.latent_kl,
+        "distance": rollouts.distance,
+    }
+    masks = {name: left if name in truth else reached for name in errors}
+    return Report(
+        by_depth=ErrorByDepth(
+            states={name: mask.sum(1) for name, mask in masks.items()},
+            errors={name: mean_over(error, masks[name]) for name, error in errors.items()},
+        ),
+        first=first,
+        value=value,
+        imagined=rollouts.value,
+        returns=truth["return"],
+        counts=left[..., 0],
+    )
+
+
+def discounted_returns(
+    reward: Any, length: np.ndarray, tail: np.ndarray, *, discount: float
+) -> np.ndarray:
+    """G_t = r_{t+1} + gamma G_{t+1} up to the last step T, where G_T = `tail`; float64.
+
+    Args:
+      reward: `[E, T]` by arrival: r_t came with o_t.
+      length: `[E]` steps of each episode; G is 0 beyond.
+      tail: `[E]`.
+      discount: gamma.
+    """
+    reward = np.asarray(reward, np.float64)
+    returns = np.zeros_like(reward)
+    for row, (steps, end) in enumerate(zip(length, tail, strict=True)):
+        returns[row, steps - 1] = end
+        for t in range(steps - 2, -1, -1):
+            returns[row, t] = reward[row, t + 1] + discount * returns[row, t + 1]
+    return returns
+
+
+def mean_over(error: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """`[E, N, K]` -> `[E, K]` over what the mask holds; NaN where that is nothing."""
+    total, count = np.where(mask, error, 0.0).sum(1), mask.sum(1)
+    return np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
+
+
+def mean_and_error(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean over the rows that are not NaN, and its standard error; `[E, K]` -> two `[K]`."""
+    there = ~np.isnan(values)
+    count = there.sum(0)
+    mean = np.where(there, values, 0.0).sum(0) / np.where(count, count, np.nan)
+    squares = np.where(there, np.square(values - mean), 0.0).sum(0)
+    variance = squares / np.where(count > 1, count - 1, np.nan)
+    return mean, np.sqrt(variance / np.where(count, count, np.nan))
+
+
+def rows(name: str, by_depth: ErrorByDepth) -> list[dict[str, Any]]:
+    """For a CSV: one row per depth and measure."""
+    result = []
+    for measure in MEASURES:
+        mean, error = mean_and_error(by_depth.errors[measure])
+        there = (~np.isnan(by_depth.errors[measure])).sum(0)
+        for k in range(len(mean)):
+            result.append(
+                {
+                    "run": name,
+                    "measure": measure,
+                    "depth": k,
+                    "mean": float(mean[k]),
+                    "standard_error": float(error[k]),
+                    "episodes": int(there[k]),
+                    "states": int(by_depth.states[measure][:, k].sum()),
+                }
+            )
+    return result
+
+
+def table(
+    reports: dict[str, Report], *, measures: tuple[str, ...] = ("value", "return")
+) -> str:
+    """A few depths of a few measures for people to read: mean +- standard error."""
+    lines = []
+    for measure in measures:
+        lines.append(f"{measure} error by depth")
+        for name, run in reports.items():
+            mean, error = mean_and_error(run.by_depth.errors[measure])
+            deepest = len(mean) - 1
+            shown = sorted({0, 1, deepest // 4, deepest // 2, deepest})
+            cells = [f"{k}: {mean[k]:.3g} +- {error[k]:.2g}" for k in shown]
+            lines.append(f"  {name:24} " + "   ".join(cells))
+    return "\n".join(lines)
