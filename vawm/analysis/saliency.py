@@ -33,6 +33,8 @@ from vawm import transforms
 from vawm.agent import Agent, make_agent
 from vawm.analysis import inference
 from vawm.analysis.episodes import Episodes, windows
+from vawm.envs.protocol import check_positive
+from vawm.errors import InvalidInput
 from vawm.policy import Policy
 from vawm.types import Array, Batch, Key, Latent, Params, PyTree, is_image
 
@@ -141,4 +143,96 @@ def norms(changes: PyTree, obs: PyTree) -> PyTree:
             return jnp.sqrt(jnp.square(change).sum(-1))
         return jnp.abs(change)
 
-    return jax.tree.map(norm, obs, changes, is_leaf=lambda x: x is None)
+    return jax.tree.map(norm, obs, changes)
+
+
+class Look(NamedTuple):
+    """F states of one episode, numpy.
+
+    Attributes:
+      step: `[F]` of the episode.
+      truth: what was observed there, `[F, ...]`.
+      saliency: of these states.
+    """
+
+    step: np.ndarray
+    truth: PyTree
+    saliency: Saliency
+
+
+def look(
+    policy: Policy,
+    episodes: Episodes,
+    *,
+    context: int,
+    frames: int,
+    seed: int,
+    unit: Unit = "symlog",
+) -> Look:
+    """Maps of `frames` states, evenly spaced over the first episode.
+
+    Every state is inferred from the `context` steps that end there, the first of which only
+    gives context; so the first state has `context` steps.
+
+    Raises:
+      InvalidInput: an impossible number, or an episode shorter than the context.
+    """
+    inference.check(policy.config, context=context, depth=1)
+    check_positive("frames", frames)
+    length = int(np.asarray(episodes.length)[0])
+    if length < context:
+        remedy = f"the first episode has {length} steps; use at most that"
+        raise InvalidInput("context", context, remedy)
+    step = np.unique(np.linspace(context - 1, length - 1, frames).round().astype(int))
+    batch = windows(episodes, np.zeros_like(step), step - (context - 1), length=context)
+    agent = make_agent(policy.config, policy.spec)
+    maps = jax.jit(make_saliency(agent, unit=unit))(
+        policy.params, policy.state, jax.random.key(seed), batch
+    )
+    truth = jax.tree.map(lambda x: x[:, -1], batch.trajectory.obs)
+    return Look(step, *jax.device_get((truth, maps)))
+
+
+def images(like: PyTree, maps: PyTree) -> np.ndarray | None:
+    """The maps of all images side by side, `[F, H, W]`; None where there are none."""
+    pairs = zip(jax.tree.leaves(like), _leaves(maps), strict=True)
+    found = [x for truth, x in pairs if is_image(truth) and x is not None]
+    return np.concatenate(found, -1) if found else None
+
+
+def coordinates(like: PyTree, maps: PyTree) -> np.ndarray | None:
+    """The maps of all vectors, one after the other, `[F, D]`; None where there are none."""
+    pairs = zip(jax.tree.leaves(like), _leaves(maps), strict=True)
+    found = [x for truth, x in pairs if not is_image(truth) and x is not None]
+    return np.concatenate(found, -1) if found else None
+
+
+def _leaves(maps: PyTree) -> list[Any]:
+    return jax.tree.leaves(maps, is_leaf=lambda x: x is None)
+
+
+def concentration(maps: np.ndarray) -> float:
+    """Share of a map's sum that its strongest tenth of entries has, mean over `[F, ...]`.
+
+    0.1 for an even map, 1 where a tenth has everything; NaN where all maps are 0.
+    """
+    flat = np.sort(np.asarray(maps, np.float64).reshape(len(maps), -1), axis=1)[:, ::-1]
+    total = flat.sum(1)
+    strongest = flat[:, : -(-flat.shape[1] // 10)].sum(1)
+    shares = strongest[total > 0] / total[total > 0]
+    return float(shares.mean()) if len(shares) else float("nan")
+
+
+def rows(name: str, look: Look) -> list[dict[str, Any]]:
+    """For a CSV: images by how concentrated a map is, vectors coordinate by coordinate."""
+    result = []
+    for kind in MAPS:
+        maps = getattr(look.saliency, kind)
+        pixels, vector = images(look.truth, maps), coordinates(look.truth, maps)
+        if pixels is not None:
+            entry = {"run": name, "map": kind, "what": "concentration"}
+            result.append(entry | {"value": concentration(pixels)})
+        for i, mean in enumerate([] if vector is None else vector.mean(0)):
+            entry = {"run": name, "map": kind, "what": f"coordinate {i}"}
+            result.append(entry | {"value": float(mean)})
+    return result

@@ -165,7 +165,8 @@ class Report(NamedTuple):
       first: the step of an episode that the first state inferred belongs to.
       value: `[E, N]` V of the inferred states s_first, s_{first + 1}, ...
       imagined: `[E, N, K + 1]` values along imagined rollouts.
-      returns: `[E, N]` G there, without bootstrap.
+      returns: `[E, N]` G there.
+      bootstrapped: `[E, N]` the same with what the critic says of the last state.
       counts: `[E, N]` bool, whether an action left from there.
     """
 
@@ -174,6 +175,7 @@ class Report(NamedTuple):
     value: np.ndarray
     imagined: np.ndarray
     returns: np.ndarray
+    bootstrapped: np.ndarray
     counts: np.ndarray
 
 
@@ -240,6 +242,7 @@ def compare(rollouts: Rollouts, episodes: Episodes, *, discount: float) -> Repor
         value=value,
         imagined=rollouts.value,
         returns=truth["return"],
+        bootstrapped=truth["bootstrapped"],
         counts=left[..., 0],
     )
 

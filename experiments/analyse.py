@@ -1,0 +1,233 @@
+"""What value alignment does, seen in trained runs, as PNG, MP4, CSV and JSON.
+
+    python experiments/analyse.py --logdirs runs/aligned runs/plain
+    python experiments/analyse.py --logdirs runs/aligned --what values --episodes 20 --depth 15
+
+    trajectories   imagination against the truth, Figs 3 and 7
+    saliency       what decoder and value depend on, Figs 3 and 13
+    values         value errors by depth of imagination, and true returns
+    curves         losses and the weight of value alignment in training, Figs 8, 9 and 12
+
+Plays whole episodes of every run in its own environments; all but `curves` is read from these.
+Works for either agent, from vectors and from pixels. Needs the extra `analysis`.
+"""
+
+from __future__ import annotations
+
+import pathlib
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import jax
+
+from vawm import cache, command_line, evaluate, flags, huge_pages, rundir
+from vawm import policy as policy_lib
+from vawm.analysis import (
+    curves,
+    episodes,
+    figures,
+    inference,
+    movies,
+    saliency,
+    tables,
+    trajectories,
+    values,
+)
+from vawm.analysis.episodes import Episodes
+from vawm.envs.protocol import check_positive
+from vawm.errors import InvalidInput
+from vawm.policy import Policy
+from vawm.types import is_image
+
+
+@dataclass(frozen=True)
+class Options:
+    """Which runs, what of them, and where it goes."""
+
+    logdirs: tuple[pathlib.Path, ...]
+    """folders of runs"""
+    what: Literal["all", "trajectories", "saliency", "values", "curves"] = "all"
+    output: pathlib.Path = pathlib.Path("analysis")
+    """folder of the results; files of the same name are written over"""
+    episodes: int = 5
+    """whole episodes of every run"""
+    depth: int = 20
+    """steps of imagination"""
+    context: int = 8
+    """steps that are seen before; a transformer infers every state from so many"""
+    frames: int = 6
+    """states of which there are saliency maps"""
+    every: int = 0
+    """steps from column to column of a strip; 0 for as many columns as fit"""
+    unit: Literal["symlog", "raw"] = "symlog"
+    """of the value that saliency differentiates"""
+    how: Literal["sample", "mode"] = "sample"
+    """sample actions from the policy, or take its mode"""
+    seed: int = 0
+
+    def wants(self, what: str) -> bool:
+        return self.what in ("all", what)
+
+
+class Loaded(NamedTuple):
+    """Runs by name; policies only where they are needed."""
+
+    policies: dict[str, Policy]
+    runs: dict[str, curves.Run]
+
+
+def names(logdirs: Sequence[pathlib.Path]) -> list[str]:
+    """The last parts of each path, as few as tell them apart."""
+    parts = [path.expanduser().absolute().parts for path in logdirs]
+    for count in range(1, max(map(len, parts)) + 1):
+        found = ["-".join(own[-count:]).replace("/", "") for own in parts]
+        if len(set(found)) == len(found):
+            return found
+    raise InvalidInput("logdirs", [str(path) for path in logdirs], "name each run once")
+
+
+def prepare(options: Options) -> Loaded:
+    """Refuses what cannot be done, and reads the runs.
+
+    Raises:
+      InvalidInput: names the option, its value and the remedy.
+      RunError: a package is missing.
+    """
+    evaluate.check(options.episodes, options.seed)
+    check_positive("frames", options.frames)
+    if options.every < 0:
+        raise InvalidInput("every", options.every, "use 0 or a number above")
+    if not options.logdirs:
+        raise InvalidInput("logdirs", (), "name the folder of at least one run")
+    called = dict(zip(names(options.logdirs), options.logdirs, strict=True))
+    rundir.check_writable(options.output, "output")
+    figures.check()
+    loaded = Loaded({}, {})
+    for name, logdir in called.items():
+        if options.what != "curves":
+            policy = policy_lib.load(logdir)
+            inference.check(policy.config, context=options.context, depth=options.depth)
+            if options.wants("trajectories") and any(
+                map(is_image, jax.tree.leaves(policy.spec.obs))
+            ):
+                movies.check()
+            loaded.policies[name] = policy
+        if options.wants("curves"):
+            loaded.runs[name] = curves.read(logdir)
+    return loaded
+
+
+def show_curves(options: Options, runs: dict[str, curves.Run]) -> None:
+    found = curves.curves(curves.group(list(runs.values())))
+    tables.write_csv(curves.rows(found), options.output / "curves.csv")
+    figures.curves(found, options.output / "curves.png")
+
+
+def show_trajectories(options: Options, played: dict[str, tuple[Policy, Episodes]]) -> None:
+    rows = []
+    for name, (policy, record) in played.items():
+        shown = trajectories.imagine(
+            policy, record, context=options.context, depth=options.depth, seed=options.seed
+        )
+        rows += trajectories.rows(name, shown)
+        kinds = trajectories.errors(shown)
+        if "image" in kinds:
+            figures.strip(
+                name, shown, options.output / f"trajectories_{name}.png", every=options.every
+            )
+            movies.write_mp4(
+                trajectories.film(shown), options.output / f"trajectories_{name}.mp4"
+            )
+        if "vector" in kinds:
+            figures.coordinates(name, shown, options.output / f"coordinates_{name}.png")
+    tables.write_csv(rows, options.output / "trajectories.csv")
+
+
+def show_saliency(options: Options, played: dict[str, tuple[Policy, Episodes]]) -> None:
+    looks = {
+        name: saliency.look(
+            policy,
+            record,
+            context=options.context,
+            frames=options.frames,
+            seed=options.seed,
+            unit=options.unit,
+        )
+        for name, (policy, record) in played.items()
+    }
+    rows: list[dict[str, Any]] = []
+    with_vectors = {}
+    for name, look in looks.items():
+        rows += saliency.rows(name, look)
+        if saliency.images(look.truth, look.saliency.value) is not None:
+            figures.saliency_images(name, look, options.output / f"saliency_{name}.png")
+        if saliency.coordinates(look.truth, look.saliency.value) is not None:
+            with_vectors[name] = look
+    if with_vectors:
+        figures.saliency_vectors(with_vectors, options.output / "saliency_vectors.png")
+    tables.write_csv(rows, options.output / "saliency.csv")
+
+
+def show_values(options: Options, played: dict[str, tuple[Policy, Episodes]]) -> None:
+    """Prints a table of what it found."""
+    reports = {
+        name: values.report(
+            policy, record, context=options.context, depth=options.depth, seed=options.seed
+        )
+        for name, (policy, record) in played.items()
+    }
+    rows = [row for name, run in reports.items() for row in values.rows(name, run.by_depth)]
+    tables.write_csv(rows, options.output / "values.csv")
+    figures.value_errors(reports, options.output / "values_by_depth.png")
+    for name, run in reports.items():
+        figures.values(name, run, options.output / f"values_{name}.png")
+    print(values.table(reports))
+
+
+def play(options: Options, policies: dict[str, Policy]) -> dict[str, tuple[Policy, Episodes]]:
+    """Records the episodes of every run, and notes what they earned in `summary.json`."""
+    played, summary = {}, {}
+    for name, policy in policies.items():
+        record = episodes.record(
+            policy, episodes=options.episodes, seed=options.seed, how=options.how
+        )
+        played[name] = policy, record
+        returns = [round(float(x), 3) for x in record.returns]
+        summary[name] = {
+            "run": curves.describe(policy.config),
+            "seed": policy.config.seed,
+            "env_steps": policy.env_steps,
+            "returns": returns,
+            "steps": [int(x) for x in record.length],
+        }
+        print(f"{name}: {evaluate.Score(tuple(returns))}", flush=True)
+    tables.write_json(summary, options.output / "summary.json")
+    return played
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Analyses; returns the exit code."""
+    options = flags.read(Options, argv, description=__doc__)
+    loaded = prepare(options)
+    options.output.mkdir(parents=True, exist_ok=True)
+    cache.enable()
+    if options.wants("curves"):
+        show_curves(options, loaded.runs)
+    if loaded.policies:
+        played = play(options, loaded.policies)
+        for what, show in {
+            "trajectories": show_trajectories,
+            "saliency": show_saliency,
+            "values": show_values,
+        }.items():
+            if options.wants(what):
+                show(options, played)
+    print(f"results are in {options.output}")
+    return 0
+
+
+if __name__ == "__main__":
+    huge_pages.use_huge_pages()
+    sys.exit(command_line.guard(main))

@@ -1,0 +1,151 @@
+"""Losses and the weight of value alignment in training, from `metrics.jsonl`: Figs 8, 9, 12.
+
+Runs that differ in nothing but their seed are one group: its curve is their mean, with the
+lowest and the highest of them around it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import pathlib
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from vawm import rundir, tracking
+from vawm.config import Config
+from vawm.errors import InvalidInput
+from vawm.tracking import Line
+
+METRICS = (
+    "loss/dynamics",
+    "latent/kl",
+    "value_alignment/loss",
+    "value_alignment/kl",
+    "value_alignment/weight",
+)
+"""Dynamics loss and KL; L_var of Eq. 4 without its weight, logged also where it is off; the KL
+of the critic's distributions; the weight of Eq. 5."""
+
+
+class Run(NamedTuple):
+    """What a folder holds: the choices of a run, and its lines of metrics."""
+
+    config: Config
+    lines: list[Line]
+
+
+class Curve(NamedTuple):
+    """One metric of one group of runs, over env steps; all `[P]` but the number of seeds."""
+
+    env_steps: np.ndarray
+    mean: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    seeds: int
+
+
+def read(logdir: pathlib.Path) -> Run:
+    """The run in `logdir`.
+
+    Raises:
+      InvalidInput: there is none that measured anything.
+    """
+    config, path = rundir.read_config(logdir), logdir / "metrics.jsonl"
+    lines = tracking.read(path) if path.exists() else []
+    if config is None or not lines:
+        remedy = "holds no metrics; name the folder of a run that wrote some"
+        raise InvalidInput("logdirs", str(logdir), remedy)
+    return Run(config, lines)
+
+
+def describe(config: Config) -> str:
+    """Task, agent, and what its value alignment is."""
+    alignment = config.value_alignment
+    weight = f" {alignment.static_weight:g}" if alignment.weight == "static" else ""
+    return f"{config.task}, {config.agent}, alignment {alignment.weight}{weight}"
+
+
+def group(runs: Sequence[Run]) -> dict[str, list[Run]]:
+    """Runs by what they share, in the order of the first of each.
+
+    Groups of one description that differ in other choices get numbers.
+    """
+    groups: list[list[Run]] = []
+    for run in runs:
+        own = next((g for g in groups if _alike(g[0].config, run.config)), None)
+        if own is None:
+            groups.append([run])
+        else:
+            own.append(run)
+    names = [describe(runs[0].config) for runs in groups]
+    numbered = [
+        name if names.count(name) == 1 else f"{name} ({names[: i + 1].count(name)})"
+        for i, name in enumerate(names)
+    ]
+    return dict(zip(numbered, groups, strict=True))
+
+
+def _alike(a: Config, b: Config) -> bool:
+    return dataclasses.replace(a, seed=0) == dataclasses.replace(b, seed=0)
+
+
+def curve(runs: Sequence[Run], metric: str) -> Curve | None:
+    """Mean and range of a metric over runs; None where some run never measured it.
+
+    On the env steps of all of them, where all have begun and none has ended; between its own
+    lines a run is interpolated linearly.
+    """
+    points = [
+        [
+            (line["env_steps"], line[metric])
+            for line in run.lines
+            if line.get(metric) is not None
+        ]
+        for run in runs
+    ]
+    if not all(points):
+        return None
+    series = [np.asarray(own, np.float64).T for own in points]
+    begin, end = max(s[0][0] for s in series), min(s[0][-1] for s in series)
+    steps = np.unique(np.concatenate([s[0] for s in series]))
+    steps = steps[(steps >= begin) & (steps <= end)]
+    if not len(steps):
+        return None
+    values = np.stack([np.interp(steps, *s) for s in series])
+    return Curve(steps, values.mean(0), values.min(0), values.max(0), len(runs))
+
+
+Curves = dict[str, dict[str, Curve]]
+"""Group -> metric -> curve; metrics that were not measured are left out."""
+
+
+def curves(groups: Mapping[str, Sequence[Run]]) -> Curves:
+    """All of `METRICS`."""
+    found = {
+        name: {metric: curve(runs, metric) for metric in METRICS}
+        for name, runs in groups.items()
+    }
+    return {
+        name: {metric: c for metric, c in own.items() if c is not None}
+        for name, own in found.items()
+    }
+
+
+def rows(all_curves: Curves) -> list[dict[str, Any]]:
+    """For a CSV: one row per group, metric and point."""
+    return [
+        {
+            "group": name,
+            "metric": metric,
+            "env_steps": int(line.env_steps[i]),
+            "mean": float(line.mean[i]),
+            "min": float(line.low[i]),
+            "max": float(line.high[i]),
+            "seeds": line.seeds,
+        }
+        for name, own in all_curves.items()
+        for metric, line in own.items()
+        for i in range(len(line.env_steps))
+    ]

@@ -1,0 +1,269 @@
+"""The numbers of this package as PNG, by matplotlib, which is imported only to draw."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import pathlib
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import jax
+import numpy as np
+
+from vawm import video
+from vawm.analysis import saliency as saliency_lib
+from vawm.analysis import trajectories as trajectories_lib
+from vawm.analysis.curves import METRICS, Curves
+from vawm.analysis.saliency import Look
+from vawm.analysis.trajectories import Trajectories
+from vawm.analysis.values import MEASURES, Report
+from vawm.runner import RunError
+
+DPI = 110
+COLUMNS = 12  # of a strip, at most
+COORDINATES = 8  # panels of a plot of vectors, at most
+
+LABELS = {
+    "value": "|V(imagined) - V(inferred)|",
+    "return": "|V(imagined) - return|",
+    "bootstrapped": "|V(imagined) - bootstrapped return|",
+    "reward": "|imagined reward - reward|",
+    "value_kl": "KL of the critic's distributions (nats)",
+    "latent_kl": "KL of posterior and prior (nats)",
+    "distance": "share of categoricals that differ",
+}
+MAPS = {
+    "sensitivity": "decoder's sensitivity to z",
+    "value": "weighted by dV/dz",
+    "observed": "dV/dx of the input",
+}
+
+
+def check() -> None:
+    """Says in one line what is missing to draw.
+
+    Raises:
+      RunError: names the package and what installs it.
+    """
+    if importlib.util.find_spec("matplotlib") is None:
+        raise RunError("matplotlib is missing: pip install matplotlib (or vawm[analysis])")
+
+
+@contextlib.contextmanager
+def panels(
+    path: pathlib.Path, rows: int, columns: int, *, size: tuple[float, float]
+) -> Iterator[np.ndarray]:
+    """`[rows, columns]` axes of `size` inches each, saved to `path` at the end."""
+    check()
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(
+        rows,
+        columns,
+        figsize=(size[0] * columns, size[1] * rows),
+        squeeze=False,
+        layout="constrained",
+    )
+    try:
+        yield axes
+        figure.savefig(path, dpi=DPI)
+    finally:
+        plt.close(figure)
+
+
+def value_errors(reports: Mapping[str, Report], path: pathlib.Path) -> None:
+    """Every measure by depth, a colour per run; bands are standard errors over episodes."""
+    shown = [
+        measure
+        for measure in MEASURES
+        if any(np.isfinite(run.by_depth.errors[measure]).any() for run in reports.values())
+    ]
+    columns = min(4, len(shown))
+    with panels(path, -(-len(shown) // columns), columns, size=(3.6, 2.9)) as axes:
+        for ax in axes.ravel()[len(shown) :]:
+            ax.set_visible(False)
+        for ax, measure in zip(axes.ravel(), shown, strict=False):
+            for color, (name, run) in enumerate(reports.items()):
+                mean = run.by_depth.mean(measure)
+                error = np.nan_to_num(run.by_depth.standard_error(measure))
+                depth = np.arange(len(mean))
+                ax.plot(depth, mean, color=f"C{color}", label=name)
+                ax.fill_between(
+                    depth, mean - error, mean + error, color=f"C{color}", alpha=0.2, lw=0
+                )
+            ax.set_title(LABELS[measure], fontsize=9)
+            ax.set_xlabel("steps of imagination", fontsize=9)
+            ax.set_ylim(bottom=0)
+        axes[0, 0].legend(fontsize=8)
+
+
+def values(name: str, report: Report, path: pathlib.Path, *, rollouts: int = 12) -> None:
+    """Left: one episode over time, with values along imagined rollouts; right: all episodes."""
+    value, returns, bootstrapped = (
+        np.where(report.counts, x, np.nan)
+        for x in (report.value, report.returns, report.bootstrapped)
+    )
+    truths = {"return": (returns, "0.6")}
+    if np.nan_to_num(bootstrapped - returns).any():  # cut by a time limit
+        truths["bootstrapped return"] = bootstrapped, "C2"
+    with panels(path, 1, 2, size=(5.6, 3.6)) as axes:
+        over_time, against = axes[0]
+        time = report.first + np.arange(value.shape[1])
+        length = int(report.counts[0].sum())
+        for label, (truth, color) in truths.items():
+            over_time.plot(time, truth[0], color=color, label=label)
+            against.plot(
+                truth.ravel(), value.ravel(), ".", ms=3, alpha=0.4, color=color, label=label
+            )
+        over_time.plot(time, value[0], color="C0", label="V of inferred states")
+        for i in np.unique(np.linspace(0, max(0, length - 1), rollouts).astype(int)):
+            steps = min(report.imagined.shape[2], length - i)
+            label = "V of imagined states" if i == 0 else None
+            imagined = report.imagined[0, i, :steps]
+            over_time.plot(time[i] + np.arange(steps), imagined, color="C3", lw=1, label=label)
+        over_time.set(title=name, xlabel="step of the first episode")
+        known = np.concatenate([truth.ravel() for truth, _ in truths.values()])
+        if np.isfinite(known).any():
+            ends = [np.nanmin(known), np.nanmax(known)]
+            against.plot(ends, ends, color="0.3", lw=1)
+        against.set(title="all episodes", xlabel="return", ylabel="V of inferred states")
+        for ax in axes[0]:
+            ax.legend(fontsize=8)
+
+
+def strip(name: str, trajectories: Trajectories, path: pathlib.Path, *, every: int = 0) -> None:
+    """Truth, imagination and difference of the first window, one column per shown step.
+
+    Args:
+      name: of the run.
+      trajectories: with images.
+      path: of the PNG.
+      every: steps from column to column; 0 for as many as fit.
+    """
+    truth = video.side_by_side(trajectories.truth)[0]
+    guess = video.side_by_side(
+        jax.tree.map(video.to_bytes, trajectories.predicted, trajectories.truth)
+    )[0]
+    difference = ((guess.astype(int) - truth + 255) // 2).astype(np.uint8)
+    length = max(1, int(trajectories.inside[0].sum()))
+    every = every or -(-length // COLUMNS)
+    # So that the last step seen is one of the columns.
+    shown = range((trajectories.context - 1) % every, length, every)
+    wide = truth.shape[2] / truth.shape[1]
+    with panels(path, 3, len(shown), size=(1.15 * wide, 1.2)) as axes:
+        for column, t in enumerate(shown):
+            ahead = t + 1 - trajectories.context
+            title = f"+{ahead}" if ahead > 0 else f"seen {ahead}" if ahead else "seen"
+            axes[0, column].set_title(title, fontsize=8, color="C3" if ahead > 0 else "C2")
+            for row, picture in enumerate((truth, guess, difference)):
+                _show(axes[row, column], picture[t])
+        for row, label in enumerate(("truth", "imagined", "difference")):
+            axes[row, 0].set_ylabel(label, fontsize=8)
+        axes[0, 0].figure.suptitle(
+            f"{name}, from step {trajectories.start[0]} of an episode", fontsize=9
+        )
+
+
+def _show(ax: Any, picture: np.ndarray) -> None:
+    ax.imshow(picture, interpolation="nearest")
+    ax.set(xticks=[], yticks=[])
+    for spine in ax.spines.values():
+        spine.set_visible(False)
+
+
+def coordinates(name: str, trajectories: Trajectories, path: pathlib.Path) -> None:
+    """Coordinates of the first window over time; of many the ones that move most."""
+    truth, guess = (x[0] for x in trajectories_lib.vectors(trajectories))
+    inside = trajectories.inside[0]
+    moving = np.argsort(-truth[inside].std(0), kind="stable")[:COORDINATES]
+    columns = min(4, len(moving))
+    time = trajectories.start[0] + np.arange(len(truth))
+    with panels(path, -(-len(moving) // columns), columns, size=(3.2, 2.2)) as axes:
+        for ax in axes.ravel()[len(moving) :]:
+            ax.set_visible(False)
+        for ax, i in zip(axes.ravel(), np.sort(moving), strict=False):
+            ax.plot(time[inside], truth[inside, i], color="0.5", label="truth")
+            ax.plot(time[inside], guess[inside, i], color="C3", label="imagined")
+            ax.axvline(time[trajectories.context - 1], color="C2", lw=1, label="last seen")
+            ax.set_title(f"symlog of coordinate {i}", fontsize=9)
+        axes[0, 0].legend(fontsize=8)
+        axes[0, 0].figure.suptitle(f"{name}, one window by step of its episode", fontsize=9)
+
+
+def saliency_images(name: str, look: Look, path: pathlib.Path) -> None:
+    """What was seen, what is decoded, and each map as heat over what was seen.
+
+    The colours of a map reach from 0 to its 99.5th percentile over all frames shown.
+    """
+    seen = video.side_by_side(jax.tree.map(lambda x: x[:, None], look.truth))[:, 0]
+    told = jax.tree.map(lambda x: x[:, None], look.saliency.decoded)
+    told = jax.tree.map(video.to_bytes, told, jax.tree.map(lambda x: x[:, None], look.truth))
+    decoded = video.side_by_side(told)[:, 0]
+    maps = {
+        label: saliency_lib.images(look.truth, getattr(look.saliency, kind))
+        for kind, label in MAPS.items()
+    }
+    heats = {label: heat(seen, found) for label, found in maps.items() if found is not None}
+    rows = {"observed": seen, "decoded": decoded} | heats
+    wide = seen.shape[2] / seen.shape[1]
+    with panels(path, len(rows), len(seen), size=(1.5 * wide, 1.55)) as axes:
+        for row, (label, pictures) in enumerate(rows.items()):
+            axes[row, 0].set_ylabel(label, fontsize=7)
+            for column, picture in enumerate(pictures):
+                _show(axes[row, column], picture)
+        for column, (step, value) in enumerate(
+            zip(look.step, look.saliency.states, strict=True)
+        ):
+            axes[0, column].set_title(f"step {step}, V {value:.3g}", fontsize=7)
+        axes[0, 0].figure.suptitle(name, fontsize=9)
+
+
+def heat(seen: np.ndarray, maps: np.ndarray) -> np.ndarray:
+    """`[F, H, W, 3]` uint8: `maps` `[F, H, W]` as colours over the darkened grey of `seen`."""
+    from matplotlib import colormaps
+
+    top = np.quantile(maps, 0.995)
+    strength = np.clip(maps / top, 0, 1) if top > 0 else np.zeros_like(maps)
+    grey = seen.mean(-1, keepdims=True) / 255
+    share = strength[..., None] ** 0.5
+    colors = colormaps["inferno"](0.25 + 0.75 * strength)[..., :3]
+    return np.round(255 * ((1 - share) * 0.5 * grey + share * colors)).astype(np.uint8)
+
+
+def saliency_vectors(looks: Mapping[str, Look], path: pathlib.Path) -> None:
+    """Each map by coordinate, mean over the frames; a colour per run."""
+    with panels(path, 1, len(MAPS), size=(4.2, 3)) as axes:
+        for ax, (kind, label) in zip(axes[0], MAPS.items(), strict=True):
+            for number, (name, look) in enumerate(looks.items()):
+                found = saliency_lib.coordinates(look.truth, getattr(look.saliency, kind))
+                assert found is not None
+                width = 0.8 / len(looks)
+                place = np.arange(found.shape[1]) + (number + 0.5) * width - 0.4
+                ax.bar(place, found.mean(0), width, label=name)
+            ax.set_title(label, fontsize=9)
+            ax.set_xlabel("coordinate", fontsize=9)
+        axes[0, 0].legend(fontsize=8)
+
+
+def curves(all_curves: Curves, path: pathlib.Path) -> None:
+    """A panel per metric, a colour per group; bands from the lowest seed to the highest."""
+    shown = [metric for metric in METRICS if any(metric in own for own in all_curves.values())]
+    with panels(path, 1, max(1, len(shown)), size=(3.6, 3)) as axes:
+        for ax, metric in zip(axes[0], shown, strict=False):
+            for color, (name, own) in enumerate(all_curves.items()):
+                if metric in own:
+                    line = own[metric]
+                    steps = line.env_steps / 1000
+                    seeds = f" ({line.seeds} seeds)" if line.seeds > 1 else ""
+                    ax.plot(steps, line.mean, color=f"C{color}", label=name + seeds)
+                    ax.fill_between(
+                        steps, line.low, line.high, color=f"C{color}", alpha=0.2, lw=0
+                    )
+            ax.set_title(metric, fontsize=9)
+            ax.set_xlabel("thousand environment steps", fontsize=9)
+        handles, labels = axes[0, 0].get_legend_handles_labels()
+        axes[0, 0].figure.legend(handles, labels, loc="outside lower center", fontsize=8)

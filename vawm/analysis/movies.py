@@ -1,0 +1,58 @@
+"""Frames as MP4, by imageio and the ffmpeg that comes with it."""
+
+from __future__ import annotations
+
+import importlib.util
+import pathlib
+
+import numpy as np
+
+from vawm.runner import RunError
+from vawm.video import FRAMES_PER_SECOND
+
+PACKAGES = {"imageio": "imageio", "imageio_ffmpeg": "imageio-ffmpeg"}
+
+
+def check() -> None:
+    """Says in one line what is missing to write a film.
+
+    Raises:
+      RunError: names the package and what installs it.
+    """
+    for module, package in PACKAGES.items():
+        if importlib.util.find_spec(module) is None:
+            raise RunError(
+                f"{package} is missing: pip install imageio[ffmpeg] (or vawm[analysis])"
+            )
+
+
+def write_mp4(
+    frames: np.ndarray,
+    path: pathlib.Path,
+    *,
+    per_second: int = FRAMES_PER_SECOND,
+    enlarge: int = 3,
+) -> None:
+    """H.264 of `[T, H, W, 3]` uint8 frames, every pixel a square of `enlarge` pixels.
+
+    Odd sides get one more row or column of the last one's colour, since the codec halves them.
+
+    Raises:
+      RunError: a package is missing.
+      OSError: the file could not be written.
+    """
+    check()
+    import imageio.v3 as imageio
+
+    large = frames.repeat(enlarge, axis=1).repeat(enlarge, axis=2)
+    odd = [(0, size % 2) for size in large.shape[1:3]]
+    even = np.pad(large, [(0, 0), *odd, (0, 0)], mode="edge")
+    imageio.imwrite(
+        path,
+        even,
+        plugin="FFMPEG",
+        fps=per_second,
+        codec="libx264",
+        macro_block_size=1,
+        ffmpeg_log_level="error",
+    )
