@@ -122,9 +122,13 @@ def values(name: str, report: Report, path: pathlib.Path, *, rollouts: int = 12)
         over_time.plot(time, value[0], color="C0", label="V of inferred states")
         for i in np.unique(np.linspace(0, max(0, length - 1), rollouts).astype(int)):
             steps = min(report.imagined.shape[2], length - i)
-            label = "V of imagined states" if i == 0 else None
-            imagined = report.imagined[0, i, :steps]
-            over_time.plot(time[i] + np.arange(steps), imagined, color="C3", lw=1, label=label)
+            over_time.plot(
+                time[i] + np.arange(steps),
+                report.imagined[0, i, :steps],
+                color="C3",
+                lw=1,
+                label="V of imagined states" if i == 0 else None,
+            )
         over_time.set(title=name, xlabel="step of the first episode")
         known = np.concatenate([truth.ravel() for truth, _ in truths.values()])
         if np.isfinite(known).any():

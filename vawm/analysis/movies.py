@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import pathlib
+import warnings
 
 import numpy as np
 
@@ -47,12 +48,15 @@ def write_mp4(
     large = frames.repeat(enlarge, axis=1).repeat(enlarge, axis=2)
     odd = [(0, size % 2) for size in large.shape[1:3]]
     even = np.pad(large, [(0, 0), *odd, (0, 0)], mode="edge")
-    imageio.imwrite(
-        path,
-        even,
-        plugin="FFMPEG",
-        fps=per_second,
-        codec="libx264",
-        macro_block_size=1,
-        ffmpeg_log_level="error",
-    )
+    with warnings.catch_warnings():
+        # JAX warns of every fork; this one runs ffmpeg at once and touches nothing of JAX.
+        warnings.filterwarnings("ignore", message=r"os\.fork\(\)", category=RuntimeWarning)
+        imageio.imwrite(
+            path,
+            even,
+            plugin="FFMPEG",
+            fps=per_second,
+            codec="libx264",
+            macro_block_size=1,
+            ffmpeg_log_level="error",
+        )

@@ -88,14 +88,15 @@ def make_saliency(
             inferred, _ = world_model.follow(model, state, key_follow, seen, horizon=1)
             return jax.tree.map(lambda x: x[:, -1], inferred)
 
+        def value_after(obs: PyTree) -> tuple[Array, Latent]:
+            latent = infer(obs)
+            return value(params, latent).sum(), latent
+
         last = jax.tree.map(lambda x: x[:, -1], batch.trajectory.obs)
-        deter, stoch = infer(last)
+        observed, (deter, stoch) = gradient(value_after, last)
 
         def decode(stoch: Array) -> PyTree:
             return world_model.predict(model, state, Latent(deter, stoch)).obs
-
-        def push(tangent: Array) -> PyTree:
-            return jax.jvp(decode, (stoch,), (tangent,))[1]
 
         def probe(total: PyTree, key: Key):
             sign = jax.random.rademacher(key, stoch.shape, stoch.dtype)
@@ -103,34 +104,50 @@ def make_saliency(
 
         # Rows do not meet in any network, so the gradient of the sum is that of each.
         slope = jax.grad(lambda z: value(params, Latent(deter, z)).sum())(stoch)
-        decoded = decode(stoch)
+        decoded, push = forward(decode, stoch)
         zero = jax.tree.map(jnp.zeros_like, decoded)
         squares, _ = jax.lax.scan(probe, zero, jax.random.split(key_probe, probes))
         return Saliency(
             decoded=decoded,
             sensitivity=norms(jax.tree.map(lambda x: jnp.sqrt(x / probes), squares), last),
             value=norms(push(slope), last),
-            observed=norms(gradient(lambda obs: value(params, infer(obs)).sum(), last), last),
+            observed=norms(observed, last),
             states=value(params, Latent(deter, stoch)),
         )
 
     return saliency
 
 
-def gradient(function: Callable[[PyTree], Array], obs: PyTree) -> PyTree:
-    """Of a scalar `function` with respect to the vectors in `obs`; None for images.
+def forward(
+    function: Callable[[Array], PyTree], x: Array
+) -> tuple[PyTree, Callable[[Array], PyTree]]:
+    """`function(x)`, and its derivative there along a direction: v -> J v.
 
-    Bytes have no gradient.
+    By transposing u -> J^T u, which is linear in u: some convolutions know their reverse
+    derivative only.
+    """
+    y, pull = jax.vjp(function, x)
+    _, push = jax.vjp(lambda u: pull(u)[0], jax.tree.map(jnp.zeros_like, y))
+    return y, lambda v: push(v)[0]
+
+
+def gradient(
+    function: Callable[[PyTree], tuple[Array, PyTree]], obs: PyTree
+) -> tuple[PyTree, PyTree]:
+    """Of the scalar that `function` returns first, and what it returns second.
+
+    With respect to the vectors in `obs`; None in the place of images, since bytes have none.
     """
     leaves, tree = jax.tree.flatten(obs)
     places = [i for i, leaf in enumerate(leaves) if not is_image(leaf)]
 
-    def of_vectors(vectors: list[Array]) -> Array:
+    def of_vectors(vectors: list[Array]) -> tuple[Array, PyTree]:
         filled = dict(enumerate(leaves)) | dict(zip(places, vectors, strict=True))
         return function(jax.tree.unflatten(tree, list(filled.values())))
 
-    slopes = dict(zip(places, jax.grad(of_vectors)([leaves[i] for i in places]), strict=True))
-    return jax.tree.unflatten(tree, [slopes.get(i) for i in range(len(leaves))])
+    found, rest = jax.grad(of_vectors, has_aux=True)([leaves[i] for i in places])
+    slopes = dict(zip(places, found, strict=True))
+    return jax.tree.unflatten(tree, [slopes.get(i) for i in range(len(leaves))]), rest
 
 
 def norms(changes: PyTree, obs: PyTree) -> PyTree:

@@ -1,0 +1,214 @@
+"""Saliency against a Jacobian that is built, and through the straight-through gradient."""
+
+import dataclasses
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import tiny
+import tiny_storm
+from test_analysis_episodes import untrained
+
+from vawm import transforms
+from vawm.agent import Agent, make_agent
+from vawm.analysis import episodes, saliency
+from vawm.errors import InvalidInput
+from vawm.policy import Policy
+from vawm.types import Batch, EnvSpec, Latent, Trajectory, image, vector
+
+MIXED = EnvSpec("mixed", {"a": image(48), "b": vector(2)}, 1, False, 2, 1, None)
+VECTORS = MIXED._replace(obs={"b": vector(2)})
+CONTEXT, FRAMES, LENGTH, SEED = 3, 2, 6, 2
+
+
+def record(spec, agent):
+    """One episode of noise."""
+    rng = np.random.default_rng(0)
+
+    def draw(leaf):
+        if leaf.dtype == jnp.uint8:
+            return jnp.asarray(rng.integers(0, 256, (1, LENGTH, *leaf.shape)), jnp.uint8)
+        return jnp.asarray(rng.normal(size=(1, LENGTH, *leaf.shape)), jnp.float32)
+
+    flag = jnp.zeros((1, LENGTH), bool)
+    action = jnp.asarray(rng.normal(size=(1, LENGTH, 1)), jnp.float32)
+    steps = Trajectory(
+        jax.tree.map(draw, spec.obs), jnp.zeros((1, LENGTH)), flag, flag, flag, action
+    )
+    memory = agent.world_model.memory(agent.initial(1).memory)
+    memory = jax.tree.map(lambda x: jnp.repeat(x[:, None], LENGTH, axis=1), memory)
+    return episodes.Episodes(steps, memory, jnp.array([LENGTH]))
+
+
+def talking(params):
+    """`params` with noise in the critic, which starts with zeros."""
+    rng = np.random.default_rng(1)
+    critic = jax.tree.map(
+        lambda x: x + jnp.asarray(rng.normal(size=x.shape) / 3, jnp.float32), params.critic
+    )
+    return params._replace(critic=critic)
+
+
+class Setting(NamedTuple):
+    policy: Policy
+    agent: Agent
+    data: episodes.Episodes
+    batch: Batch
+    unit: saliency.Unit
+    maps: saliency.Saliency
+
+    def follow(self, batch):
+        """The states at the ends of `batch`, drawn as the maps were."""
+        key = jax.random.split(jax.random.key(SEED))[0]
+        inferred, _ = self.agent.world_model.follow(
+            self.policy.params.world_model, self.policy.state, key, batch, horizon=1
+        )
+        return jax.tree.map(lambda x: x[:, -1], inferred)
+
+    def value(self, latent):
+        logits = self.agent.critic.logits(self.policy.params.critic, latent)
+        mean = self.agent.critic.code.mean(logits)
+        return transforms.symlog(mean) if self.unit == "symlog" else mean
+
+
+@pytest.fixture(
+    scope="module",
+    params=[(tiny.CONFIG, MIXED, "symlog"), (tiny_storm.CONFIG, VECTORS, "raw")],
+    ids=["rssm", "storm"],
+)
+def setting(request):
+    config, spec, unit = request.param
+    model = dataclasses.replace(config.world_model, depth=1)
+    policy = untrained(dataclasses.replace(config, world_model=model), spec)
+    policy = policy._replace(params=talking(policy.params))
+    agent = make_agent(policy.config, spec)
+    data = record(spec, agent)
+    batch = episodes.windows(data, [0, 0], [0, LENGTH - CONTEXT], length=CONTEXT)
+    make = jax.jit(saliency.make_saliency(agent, unit=unit, probes=400))
+    maps = make(policy.params, policy.state, jax.random.key(SEED), batch)
+    return Setting(policy, agent, data, batch, unit, maps)
+
+
+@pytest.fixture(scope="module")
+def straight(setting):
+    """The states that the maps are of, and the gradient of the value through their z."""
+    batch = setting.batch
+
+    def weighed(last):
+        obs = batch.trajectory.obs
+        seen = obs | {"b": obs["b"].at[:, -1].set(last)}
+        moved = batch._replace(trajectory=batch.trajectory._replace(obs=seen))
+        latent = setting.follow(moved)
+        slope = jax.grad(lambda z: setting.value(Latent(latent.deter, z)).sum())(latent.stoch)
+        # Only the draw of z is differentiated: its gradient is that of its probabilities.
+        return (latent.stoch * jax.lax.stop_gradient(slope)).sum(), latent
+
+    gradient = jax.jit(jax.grad(weighed, has_aux=True))
+    return gradient(batch.trajectory.obs["b"][:, -1])
+
+
+PIXELS = np.random.default_rng(5).integers(48, size=(2, 12))  # some of them
+
+
+def some(maps):
+    """`[F, ...]` at `PIXELS`, and all coordinates."""
+    return {k: x[:, *PIXELS] if x.ndim > 2 else x for k, x in maps.items()}
+
+
+@pytest.fixture(scope="module")
+def slow(setting, straight):
+    """Rows of the decoder's Jacobian, `[F, ..., S * K]`, and dV/dz."""
+    policy, agent, *_ = setting
+    latent = straight[1]
+
+    def decode(z, h):
+        one = Latent(h[None], z[None])
+        obs = agent.world_model.predict(policy.params.world_model, policy.state, one).obs
+        return jax.tree.map(lambda x: x[0], some(obs))
+
+    def value(z, h):
+        return setting.value(Latent(h[None], z[None]))[0]
+
+    jacobian, slope = jax.jit(
+        jax.vmap(lambda *s: (jax.jacrev(decode)(*s), jax.grad(value)(*s)))
+    )(latent.stoch, latent.deter)
+    flat = {k: np.asarray(x, np.float64) for k, x in jacobian.items()}
+    flat = {k: x.reshape(*x.shape[:-2], -1) for k, x in flat.items()}
+    return flat, np.asarray(slope, np.float64).reshape(FRAMES, -1)
+
+
+def over_colours(squares, kind):
+    """Euclidean norm, or absolute value."""
+    return np.sqrt(squares.sum(-1) if kind == "a" else squares)
+
+
+def test_the_value_map_is_the_jacobian_times_the_slope_of_the_value(setting, slow):
+    jacobians, slope = slow
+    for kind, jacobian in jacobians.items():
+        moved = np.einsum("f...j,fj->f...", jacobian, slope)
+        actual = np.asarray(some(setting.maps.value)[kind])
+        expected = over_colours(moved**2, kind)
+        np.testing.assert_allclose(actual, expected, rtol=1e-3, atol=1e-3 * expected.max())
+        assert (actual > 0).any()
+
+
+def test_the_sensitivity_is_the_length_of_the_jacobian_s_rows(setting, slow):
+    """Within five standard errors of its random signs, of which each is at most 7 %."""
+    for kind, jacobian in slow[0].items():
+        exact = over_colours((jacobian**2).sum(-1), kind)
+        ratio = (np.asarray(some(setting.maps.sensitivity)[kind]) / exact) ** 2
+        assert abs(ratio - 1).max() < 5 * np.sqrt(2 / 400)
+        assert ratio.mean() == pytest.approx(1, abs=0.15)
+
+
+def test_the_observed_gradient_goes_through_the_probabilities_of_z(setting, straight):
+    actual = np.asarray(setting.maps.observed["b"])
+    np.testing.assert_allclose(actual, np.abs(straight[0]), rtol=1e-3, atol=1e-8)
+    assert (actual > 0).all()
+    assert setting.maps.observed.get("a") is None  # bytes have no gradient
+
+
+def test_the_value_is_in_its_unit(setting, straight):
+    np.testing.assert_allclose(setting.maps.states, setting.value(straight[1]), rtol=1e-4)
+
+
+def test_a_look_at_an_episode_is_evenly_spaced(setting):
+    policy, _, data, *_ = setting
+    if "a" in data.trajectory.obs:
+        return  # the same, for more work
+    look = saliency.look(policy, data, context=CONTEXT, frames=3, seed=0)
+    assert look.step.tolist() == [2, 4, 5]  # 3.5 rounds to the even
+    np.testing.assert_array_equal(look.truth["b"], data.trajectory.obs["b"][0, look.step])
+    assert saliency.coordinates(look.truth, look.saliency.observed).shape == (3, 2)
+
+
+def test_rows_are_of_images_and_of_coordinates(setting):
+    truth = jax.tree.map(lambda x: x[:, -1], setting.batch.trajectory.obs)
+    look = saliency.Look(np.array([2, 5]), *jax.device_get((truth, setting.maps)))
+    rows = {(row["map"], row["what"]): row["value"] for row in saliency.rows("run", look)}
+    expected = np.mean(setting.maps.observed["b"][:, 1])
+    assert rows["observed", "coordinate 1"] == pytest.approx(expected)
+    assert ("observed", "concentration") not in rows
+    assert saliency.images(look.truth, look.saliency.observed) is None
+    if "a" in truth:
+        pixels = saliency.images(look.truth, look.saliency.value)
+        np.testing.assert_array_equal(pixels, setting.maps.value["a"])
+        assert rows["value", "concentration"] == saliency.concentration(pixels)
+
+
+def test_what_cannot_be_looked_at_is_refused(setting):
+    policy, _, data, *_ = setting
+    with pytest.raises(InvalidInput, match="context=7: the first episode has 6 steps"):
+        saliency.look(policy, data, context=7, frames=1, seed=0)
+    with pytest.raises(InvalidInput, match="frames=0: use a whole number"):
+        saliency.look(policy, data, context=3, frames=0, seed=0)
+
+
+def test_concentration_by_hand():
+    even, single = np.ones((1, 10, 2)), np.zeros((1, 10, 2))
+    single[0, 3, 1] = 5.0
+    assert saliency.concentration(even) == pytest.approx(0.1)
+    assert saliency.concentration(np.concatenate([even, single])) == pytest.approx(0.55)
+    assert np.isnan(saliency.concentration(np.zeros((2, 4))))
