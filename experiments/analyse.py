@@ -41,6 +41,8 @@ from vawm.errors import InvalidInput
 from vawm.policy import Policy
 from vawm.types import is_image
 
+FRAMES_PER_SECOND = 5  # slow enough to compare
+
 
 @dataclass(frozen=True)
 class Options:
@@ -137,9 +139,8 @@ def show_trajectories(options: Options, played: dict[str, tuple[Policy, Episodes
             figures.strip(
                 name, shown, options.output / f"trajectories_{name}.png", every=options.every
             )
-            movies.write_mp4(
-                trajectories.film(shown), options.output / f"trajectories_{name}.mp4"
-            )
+            film = options.output / f"trajectories_{name}.mp4"
+            movies.write_mp4(trajectories.film(shown), film, per_second=FRAMES_PER_SECOND)
         if "vector" in kinds:
             figures.coordinates(name, shown, options.output / f"coordinates_{name}.png")
     tables.write_csv(rows, options.output / "trajectories.csv")

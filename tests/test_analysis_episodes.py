@@ -7,6 +7,7 @@ import pytest
 import tiny
 import tiny_pixels
 import tiny_storm
+from analysis_records import make_policy
 
 from vawm import play
 from vawm.agent import make_agent
@@ -18,17 +19,9 @@ from vawm.policy import Policy
 from vawm.types import vector
 
 
-def untrained(config, spec):
-    """A policy with fresh parameters."""
-    agent = make_agent(config, spec)
-    params, state = jax.jit(agent.init)(jax.random.key(0))
-    act = jax.jit(agent.act, static_argnames="how")
-    return Policy(config, spec, 0, params, state, agent.initial, act)
-
-
 @pytest.fixture(scope="module", params=[tiny.CONFIG, tiny_storm.CONFIG], ids=["rssm", "storm"])
 def policy(request):
-    return untrained(request.param, tiny.env().spec)
+    return make_policy(request.param, tiny.env().spec)
 
 
 @pytest.fixture(scope="module")

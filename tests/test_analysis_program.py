@@ -6,14 +6,13 @@ import json
 import pathlib
 import sys
 
-import jax
 import numpy as np
 import pytest
 import tiny
-import tiny_storm
+import toy
+from analysis_records import make_episodes, make_policy
 
-from vawm import checkpoint, command_line, rundir, train
-from vawm.agent import make_agent
+from vawm import checkpoint, command_line, rundir
 from vawm.analysis import figures, tables
 from vawm.analysis.saliency import Look, Saliency
 from vawm.analysis.trajectories import Trajectories
@@ -25,32 +24,31 @@ sys.modules["analyse"] = analyse  # where dataclasses look their types up
 spec.loader.exec_module(analyse)
 
 
-def save(logdir, config):
-    """An untrained run in `logdir`, with two lines of metrics."""
-    env = tiny.env()
-    agent = make_agent(config, env.spec)
-    state = jax.jit(lambda key: train.init(env, agent, config, key))(jax.random.key(3))
-    checkpoint.save(logdir, state, env_steps=8, config=config, spec=env.spec, progress={})
-    rundir.write_config(logdir, config)
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """The folder of a run that saved what acting needs, with two lines of metrics."""
+    logdir = tmp_path_factory.mktemp("runs") / "tiny"
+    logdir.mkdir()
+    policy = make_policy(tiny.CONFIG, tiny.env().spec)
+    state = toy.state()
+    state = state._replace(learner=state.learner._replace(params=policy.params))
+    checkpoint.save(
+        logdir, state, env_steps=8, config=policy.config, spec=policy.spec, progress={}
+    )
+    rundir.write_config(logdir, policy.config)
     lines = [{"env_steps": n, "latent/kl": n / 8, "loss/dynamics": None} for n in (8, 16)]
     (logdir / "metrics.jsonl").write_text("".join(json.dumps(x) + "\n" for x in lines))
     return str(logdir)
 
 
-@pytest.fixture(scope="module")
-def runs(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("runs")
-    return save(folder / "rssm", tiny.CONFIG), save(folder / "storm", tiny_storm.CONFIG)
-
-
 @pytest.fixture
 def offline(monkeypatch):
-    """No cache but that of the tests, and episodes of the probe that `save` is of."""
+    """No cache but that of the tests, and made-up episodes."""
     monkeypatch.setattr(analyse.cache, "enable", lambda: None)
 
     def record(policy, *, episodes, seed, how):
-        env = tiny.env()
-        return analyse.episodes.record_in(env, policy, episodes=episodes, seed=seed, how=how)
+        assert how == "sample"
+        return make_episodes(policy, episodes=episodes, length=6, seed=seed)
 
     monkeypatch.setattr(analyse.episodes, "record", record)
 
@@ -72,23 +70,18 @@ def offline(monkeypatch):
             ["--logdirs", ".", "--output", "/dev/null/a"],
             "output='/dev/null/a': is not writable",
         ),
-        (["--logdirs", "RSSM", "--depth", "0"], "depth=0: use a whole number of at least 1"),
-        (["--logdirs", "RSSM", "--context", "1"], "context=1: use at least 2"),
+        (["--logdirs", "RUN", "--depth", "0"], "depth=0: use a whole number of at least 1"),
+        (["--logdirs", "RUN", "--context", "1"], "context=1: use at least 2"),
         (
-            ["--logdirs", "RSSM", "STORM", "--context", "3", "--depth", "6"],
-            "depth=6: use at most 5 after the context",
-        ),
-        (
-            ["--logdirs", "RSSM", "--dept", "3"],
+            ["--logdirs", "RUN", "--dept", "3"],
             "--dept='3': no such flag; did you mean --depth",
         ),
     ],
 )
-def test_bad_input_is_one_line_and_code_2(flags, message, runs, capsys, monkeypatch, tmp_path):
-    places = dict(zip(("RSSM", "STORM"), runs, strict=True))
+def test_bad_input_is_one_line_and_code_2(flags, message, run, capsys, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(analyse, "play", None)  # nothing is computed
-    flags = [places.get(word, word) for word in flags]
+    flags = [run if word == "RUN" else word for word in flags]
     assert command_line.guard(lambda: analyse.main(flags)) == 2
     output = capsys.readouterr()
     assert output.err.startswith(f"error: {message}")
@@ -97,37 +90,37 @@ def test_bad_input_is_one_line_and_code_2(flags, message, runs, capsys, monkeypa
     assert not list(tmp_path.iterdir())
 
 
-def test_a_missing_package_is_told_before_anything_is_computed(runs, capsys, monkeypatch):
+def test_a_missing_package_is_told_before_anything_is_computed(run, capsys, monkeypatch):
     monkeypatch.setattr(figures.importlib.util, "find_spec", lambda _: None)
     monkeypatch.setattr(analyse, "play", None)
-    assert command_line.guard(lambda: analyse.main(["--logdirs", runs[0]])) == 1
+    assert command_line.guard(lambda: analyse.main(["--logdirs", run])) == 1
     assert capsys.readouterr().err.startswith("error: matplotlib is missing: pip install")
 
 
-def test_all_of_it_on_both_agents(runs, offline, tmp_path, capsys):
+def test_all_of_it(run, offline, tmp_path, capsys):
     output = tmp_path / "results"
-    flags = ["--logdirs", *runs, "--output", str(output), "--episodes", "2"]
+    flags = ["--logdirs", run, "--output", str(output), "--episodes", "2"]
     flags += ["--depth", "2", "--context", "2", "--frames", "2"]
     assert analyse.main(flags) == 0
     files = {path.name for path in output.iterdir()}
-    own = {
-        f"{what}_{run}.png" for what in ("values", "coordinates") for run in ("rssm", "storm")
+    pictures = {
+        "values_by_depth",
+        "saliency_vectors",
+        "curves",
+        "values_tiny",
+        "coordinates_tiny",
     }
-    common = {"values_by_depth.png", "saliency_vectors.png", "curves.png", "summary.json"}
-    tables = {"values.csv", "trajectories.csv", "saliency.csv", "curves.csv"}
-    assert files == own | common | tables
+    written = {"values", "trajectories", "saliency", "curves"}
+    expected = {f"{name}.png" for name in pictures} | {f"{name}.csv" for name in written}
+    assert files == expected | {"summary.json"}
     assert all((output / name).stat().st_size for name in files)
     with (output / "values.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    zero = [row["mean"] for row in rows if row["measure"] == "value" and row["depth"] == "0"]
-    assert zero == ["0", "0"]
-    unknown = [
-        row["mean"] for row in rows if (row["run"], row["measure"]) == ("storm", "latent_kl")
-    ]
-    assert unknown == 3 * [""]
+        rows = [row for row in csv.DictReader(file) if row["measure"] == "value"]
+    assert [row["depth"] for row in rows] == ["0", "1", "2"]
+    assert [row["mean"] == "0" for row in rows] == [True, False, False]
     summary = json.loads((output / "summary.json").read_text())
-    assert len(summary["rssm"]["returns"]) == 2
-    assert "value error by depth\n  rssm" in capsys.readouterr().out
+    assert len(summary["tiny"]["returns"]) == 2
+    assert "value error by depth\n  tiny" in capsys.readouterr().out
 
 
 def test_runs_are_named_by_what_tells_them_apart():
@@ -154,7 +147,7 @@ def test_pictures_of_pixels_are_drawn(tmp_path):
     figures.strip("run", shown, tmp_path / "strip.png", every=2)
     maps = rng.uniform(size=(2, 48, 48))
     seen = Saliency(told[:, 0], maps, 0 * maps, None, np.ones(2))
-    look = Look(np.array([3, 4]), truth[:, 0], seen)
+    look = Look(np.array([3, 4]), truth[:, 0], seen, "symlog")
     figures.saliency_images("run", look, tmp_path / "saliency.png")
     assert all((tmp_path / name).stat().st_size for name in ("strip.png", "saliency.png"))
 

@@ -3,37 +3,22 @@
 import subprocess
 import sys
 
-import jax
 import numpy as np
 import pytest
 import tiny
-from test_analysis_episodes import untrained
+from analysis_records import make_episodes, make_policy
 
-from vawm.analysis import episodes, movies, trajectories
+from vawm.analysis import movies, trajectories
 from vawm.analysis.trajectories import Trajectories
 from vawm.errors import InvalidInput
 from vawm.runner import RunError
 from vawm.transforms import symlog
-from vawm.types import Trajectory
 
 
 @pytest.fixture(scope="module")
 def played():
-    """A policy, and 3 episodes of 10 steps, made up."""
-    spec = tiny.env().spec
-    policy, rng = untrained(tiny.CONFIG, spec), np.random.default_rng(0)
-    flag = np.zeros((3, 10), bool)
-    steps = Trajectory(
-        obs=rng.normal(size=(3, 10, 2)).astype(np.float32),
-        reward=np.zeros((3, 10), np.float32),
-        is_first=flag,
-        is_last=flag,
-        is_terminal=flag,
-        action=rng.normal(size=(3, 10, 1)).astype(np.float32),
-    )
-    memory = policy.initial(30).memory
-    memory = jax.tree.map(lambda x: x.reshape(3, 10, *x.shape[1:]), memory)
-    return policy, episodes.Episodes(steps, memory, np.full(3, 10))
+    policy = make_policy(tiny.CONFIG, tiny.env().spec)
+    return policy, make_episodes(policy, episodes=3, length=10)
 
 
 def test_a_window_is_one_of_the_episode(played):
@@ -49,9 +34,10 @@ def test_a_window_is_one_of_the_episode(played):
 
 def test_a_window_longer_than_the_episode_says_what_is_inside(played):
     policy, record = played
-    found = trajectories.imagine(policy, record, context=4, depth=8, seed=0)
-    np.testing.assert_array_equal(found.start, [1, 1, 1])
-    assert found.inside.tolist() == 3 * [9 * [True] + 3 * [False]]
+    short = record._replace(length=np.array([4, 6, 10]))
+    found = trajectories.imagine(policy, short, context=2, depth=4, seed=0, at_most=2)
+    np.testing.assert_array_equal(found.start, [1, 1])
+    assert found.inside.tolist() == [3 * [True] + 3 * [False], 5 * [True] + [False]]
 
 
 def hand():

@@ -135,8 +135,8 @@ def values(name: str, report: Report, path: pathlib.Path, *, rollouts: int = 12)
             ends = [np.nanmin(known), np.nanmax(known)]
             against.plot(ends, ends, color="0.3", lw=1)
         against.set(title="all episodes", xlabel="return", ylabel="V of inferred states")
-        for ax in axes[0]:
-            ax.legend(fontsize=8)
+        over_time.legend(fontsize=8)
+        against.legend(fontsize=8, markerscale=3)
 
 
 def strip(name: str, trajectories: Trajectories, path: pathlib.Path, *, every: int = 0) -> None:
@@ -219,10 +219,11 @@ def saliency_images(name: str, look: Look, path: pathlib.Path) -> None:
             axes[row, 0].set_ylabel(label, fontsize=7)
             for column, picture in enumerate(pictures):
                 _show(axes[row, column], picture)
+        name_of_v = "V" if look.unit == "raw" else "symlog V"
         for column, (step, value) in enumerate(
             zip(look.step, look.saliency.states, strict=True)
         ):
-            axes[0, column].set_title(f"step {step}, V {value:.3g}", fontsize=7)
+            axes[0, column].set_title(f"step {step}, {name_of_v} {value:.3g}", fontsize=7)
         axes[0, 0].figure.suptitle(name, fontsize=9)
 
 

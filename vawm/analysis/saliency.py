@@ -56,7 +56,7 @@ class Saliency(NamedTuple):
 
 
 def make_saliency(
-    agent: Agent, *, unit: Unit = "symlog", probes: int = 64
+    agent: Agent, *, unit: Unit = "symlog", probes: int = 128
 ) -> Callable[[Params, PyTree, Key, Batch], Saliency]:
     """Build `saliency(params, state, key, batch) -> Saliency`, of the last step of each row.
 
@@ -170,11 +170,13 @@ class Look(NamedTuple):
       step: `[F]` of the episode.
       truth: what was observed there, `[F, ...]`.
       saliency: of these states.
+      unit: of V.
     """
 
     step: np.ndarray
     truth: PyTree
     saliency: Saliency
+    unit: Unit
 
 
 def look(
@@ -207,7 +209,7 @@ def look(
         policy.params, policy.state, jax.random.key(seed), batch
     )
     truth = jax.tree.map(lambda x: x[:, -1], batch.trajectory.obs)
-    return Look(step, *jax.device_get((truth, maps)))
+    return Look(step, jax.device_get(truth), jax.device_get(maps), unit)
 
 
 def images(like: PyTree, maps: PyTree) -> np.ndarray | None:
