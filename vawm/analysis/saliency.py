@@ -15,7 +15,7 @@ any vector, h held fixed. The third goes through encoder and posterior of the la
 through the draw of z by the straight-through gradient, that of the probabilities; h does not
 depend on x. Where z is not drawn, it is the gradient itself.
 
-V is the critic's mean, or symlog of it. Decoded images are in [0, 1], decoded vectors in
+V is the critic's mean, or symlog of it. Images are in [0, 1], decoded vectors in
 symlog. Of the colours of a pixel a map holds the Euclidean norm, which for a single one is the
 absolute value.
 """
@@ -51,7 +51,7 @@ class Saliency(NamedTuple):
     decoded: PyTree
     sensitivity: PyTree
     value: PyTree
-    observed: PyTree  # None in the place of images
+    observed: PyTree
     states: Array  # [F] V of the states
 
 
@@ -136,29 +136,22 @@ def gradient(
 ) -> tuple[PyTree, PyTree]:
     """Of the scalar that `function` returns first, and what it returns second.
 
-    With respect to the vectors in `obs`; None in the place of images, since bytes have none.
+    Bytes have no gradient: `function` gets pixels as floats from 0 to 255, and is
+    differentiated by a 255th of them, in [0, 1] like what is decoded.
     """
-    leaves, tree = jax.tree.flatten(obs)
-    places = [i for i, leaf in enumerate(leaves) if not is_image(leaf)]
+    units = jax.tree.map(lambda x: 255.0 if is_image(x) else 1.0, obs)
 
-    def of_vectors(vectors: list[Array]) -> tuple[Array, PyTree]:
-        filled = dict(enumerate(leaves)) | dict(zip(places, vectors, strict=True))
-        return function(jax.tree.unflatten(tree, list(filled.values())))
+    def of_units(scaled: PyTree) -> tuple[Array, PyTree]:
+        return function(jax.tree.map(jnp.multiply, scaled, units))
 
-    found, rest = jax.grad(of_vectors, has_aux=True)([leaves[i] for i in places])
-    slopes = dict(zip(places, found, strict=True))
-    return jax.tree.unflatten(tree, [slopes.get(i) for i in range(len(leaves))]), rest
+    return jax.grad(of_units, has_aux=True)(jax.tree.map(jnp.divide, obs, units))
 
 
 def norms(changes: PyTree, obs: PyTree) -> PyTree:
-    """Euclidean norm over the colours of images, absolute value for vectors; None stays."""
+    """Euclidean norm over the colours of images, absolute value for vectors."""
 
-    def norm(like: Array, change: Array | None) -> Array | None:
-        if change is None:
-            return None
-        if is_image(like):
-            return jnp.sqrt(jnp.square(change).sum(-1))
-        return jnp.abs(change)
+    def norm(like: Array, change: Array) -> Array:
+        return jnp.sqrt(jnp.square(change).sum(-1)) if is_image(like) else jnp.abs(change)
 
     return jax.tree.map(norm, obs, changes)
 

@@ -92,10 +92,11 @@ def make_codecs(
         return init_all
 
     def encode(params: PyTree, state: PyTree, obs: PyTree, *, train: bool):
-        arrays = jax.tree.leaves(obs)
+        # By the spec: pixels may come as floats, which have a gradient.
+        pairs = list(zip(leaves, jax.tree.leaves(obs), strict=True))
         kinds = {
-            "vector": [x for x in arrays if not is_image(x)],
-            "image": [x for x in arrays if is_image(x)],
+            "vector": [x for leaf, x in pairs if not is_image(leaf)],
+            "image": [x for leaf, x in pairs if is_image(leaf)],
         }
         tokens, states = {}, {}
         for kind, codec in codecs.items():
