@@ -9,6 +9,8 @@
     vawm.train, vawm.host_train         the step around MJX, and around host environments
     vawm.runner, vawm.checkpoint        runs on disk
     vawm.evaluate, vawm.scores          protocols of the suites, and published scores
+    vawm.analysis       what value alignment does, in numbers and pictures
+    vawm.sweep          many runs of one program, tables and curves of them
     vawm.load           a policy from a run's checkpoint
 
 Importing the package imports none of them. `vawm.losses` imports neither networks nor
