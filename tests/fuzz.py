@@ -1,0 +1,91 @@
+"""Random configs: tiny ones of every agent, a few of whose choices are anything at all.
+
+Each has to be refused by the name of a choice, or to train. What is judged here is all of it but
+the numbers: the whole training step is traced, shapes and dtypes checked, nothing computed.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import typing
+
+import jax
+import tiny
+import tiny_storm
+import tiny_vagram
+from hypothesis import strategies as st
+
+from vawm import runner, train, validate
+from vawm.agent import make_agent
+from vawm.config import Config
+from vawm.errors import InvalidInput
+
+BASES = {"dreamerv3": tiny.CONFIG, "storm": tiny_storm.CONFIG, "vagram": tiny_vagram.CONFIG}
+
+USUAL_INTS = st.integers(1, 9) | st.sampled_from([0, 16, 24, 32, 48, 64, 200])
+INTS = USUAL_INTS | st.sampled_from([-1, 255, 1000, 10**6, 2**31 - 1, 2**31, 2**32, 10**12])
+USUAL_FLOATS = st.floats(0, 2) | st.sampled_from([0.0, 0.5, 1.0, 1e-3, 10.0, 333.0])
+FLOATS = USUAL_FLOATS | st.sampled_from([-1.0, 1e-30, 1e30, math.nan, math.inf, -math.inf])
+JUNK = st.none() | st.booleans() | st.text(max_size=3) | st.just([]) | FLOATS | INTS
+
+
+def value_of(kind: typing.Any) -> st.SearchStrategy:
+    """Mostly what the type allows, sometimes junk."""
+    if typing.get_origin(kind) is typing.Literal:
+        usual = st.sampled_from(typing.get_args(kind))
+    elif kind is bool:
+        usual = st.booleans()
+    elif kind is int:
+        usual = USUAL_INTS
+    elif kind is float:
+        usual = USUAL_FLOATS
+    else:
+        usual = st.text(max_size=3)
+    return st.one_of(usual, usual, usual, INTS if kind is int else FLOATS, JUNK)
+
+
+@st.composite
+def configs(draw: st.DrawFn) -> Config:
+    config = BASES[draw(st.sampled_from(sorted(BASES)))]
+    fields = list(validate.fields(config))
+    count = draw(st.integers(1, 4))
+    chosen = draw(st.lists(st.sampled_from(fields), min_size=count, max_size=count))
+    for name, _, kind in chosen:
+        config = replace(config, name, draw(value_of(kind)))
+    return config
+
+
+def replace(config: typing.Any, name: str, value: typing.Any) -> typing.Any:
+    """`config` with the field of a dotted name replaced."""
+    head, _, rest = name.partition(".")
+    if rest:
+        value = replace(getattr(config, head), rest, value)
+    return dataclasses.replace(config, **{head: value})
+
+
+def judge(config: Config, folder) -> str:
+    """Why `config` is refused, or "" if it trains.
+
+    Raises:
+      Exception: neither.
+    """
+    env = tiny.env()
+    try:
+        runner.check(config, folder, resume=False, known_task=False)
+        program = runner.prepare(config, env)
+    except InvalidInput as error:
+        names = {name for name, _ in validate.values(BASES["dreamerv3"])}
+        names |= {name for base in BASES.values() for name, _ in validate.values(base)}
+        names |= {"world_model", "optimizer", "env"}
+        assert error.field in names, error
+        assert "\n" not in str(error), error
+        return str(error)
+    before = program.shapes
+    step = train.make_train_step(env, make_agent(config, env.spec), config)
+    after, metrics = jax.eval_shape(step, before)
+    assert jax.tree.structure(after) == jax.tree.structure(before)
+    for new, old in zip(jax.tree.leaves(after), jax.tree.leaves(before), strict=True):
+        assert (new.shape, new.dtype) == (old.shape, old.dtype)
+    assert all(metric.shape == () for metric in metrics.values())
+    return ""
