@@ -78,6 +78,7 @@ LAYERS = {
 }
 HOST = {
     "analysis",
+    "backends",
     "checkpoint",
     "command_line",
     "display",

@@ -417,6 +417,10 @@ class Config:
     """steps in every environment between updates, inside one jitted call"""
     compute_dtype: Literal["auto", "float32", "bfloat16"] = "auto"
     """auto: bfloat16 on GPU and TPU, float32 on CPU"""
+    tracker: Literal["none", "wandb", "trackio"] = "none"
+    """where lines of metrics and videos go besides metrics.jsonl and TensorBoard"""
+    tracker_project: str = "vawm"
+    """name of the project there"""
     log_every: int = 2_000
     """env steps between lines of metrics.jsonl"""
     save_every: int = 50_000

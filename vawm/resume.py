@@ -20,6 +20,7 @@ MAY_DIFFER = (
     *("env_steps", "log_every", "save_every"),
     *("video.every", "video.sequences", "video.context", "video.episode_steps"),
     *("env.workers", "env.timeout", "env.on_failure"),
+    *("tracker", "tracker_project"),
 )
 """What changes neither what a run learns nor what it has stored."""
 

@@ -18,7 +18,17 @@ from typing import Any, NamedTuple
 import jax
 import rich.console
 
-from vawm import checkpoint, memory, rundir, signals, suites, tracking, validate, video
+from vawm import (
+    backends,
+    checkpoint,
+    memory,
+    rundir,
+    signals,
+    suites,
+    tracking,
+    validate,
+    video,
+)
 from vawm import program as program_lib
 from vawm import resume as resume_lib
 from vawm.config import Config
@@ -131,6 +141,7 @@ def check(
     validate.check(config)
     if known_task:
         suites.check_task(config)
+    backends.check(config)
     if resume:
         resume_lib.check(logdir, config)
         rundir.check_writable(logdir)
@@ -195,10 +206,14 @@ def _loop(
     save = functools.partial(_save, logdir=logdir, config=config, program=program)
     film = video.make(program, config)
     last_saved = progress.env_steps
-    purge_after = progress.logged if progress.env_steps else None
+    resumed = bool(progress.env_steps)
+    purge_after = progress.logged if resumed else None
+    further = backends.connect(config, logdir, resumed=resumed, say=display.note)
     with (
         signals.catch(lambda: display.note("stopping after this step ...")) as stop,
-        tracking.Tracker(logdir, purge_after=purge_after) as tracker,
+        tracking.Tracker(
+            logdir, purge_after=purge_after, further=further, say=display.note
+        ) as tracker,
         display,
     ):
         tracker.show_videos(after=progress.logged)

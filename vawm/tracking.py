@@ -3,6 +3,10 @@
 `metrics.jsonl` is the source of truth: one strictly valid JSON object per line, written
 when the interval between two lines is complete. Means weigh every chunk by its number of
 updates; counts are sums. An `Interval` is plain numbers, so a checkpoint can carry it.
+
+TensorBoard's file lies beside it: what keeps the one from being written (a full disk) stops the
+run, because the other and the next checkpoint would fail too. Any other failure of TensorBoard
+is one warning, and the run goes on without it. Further backends are those of `vawm.backends`.
 """
 
 from __future__ import annotations
@@ -14,8 +18,8 @@ import pathlib
 import socket
 import struct
 import time
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, Protocol
 
 from tensorboardX.proto.event_pb2 import Event, SessionLog
 from tensorboardX.proto.summary_pb2 import Summary
@@ -26,7 +30,7 @@ from vawm.video import Video, as_gif
 Line = dict[str, Any]
 
 COUNTERS = ("env_steps", "updates")
-VIDEOS, VIDEO_LINES = "videos", "videos.jsonl"
+METRICS, VIDEOS, VIDEO_LINES = "metrics.jsonl", "videos", "videos.jsonl"
 EPISODE_SUMS = ("episode/return", "episode/length")
 
 
@@ -46,6 +50,19 @@ class Interval(NamedTuple):
     counted: dict[str, float] = {}  # noqa: RUF012
     env_steps: int = 0
     seconds: float = 0.0
+
+
+class Backend(Protocol):
+    """Where lines go besides `metrics.jsonl`."""
+
+    def write(self, entry: Line) -> None:
+        """Takes one line of metrics, at step `entry["env_steps"]`."""
+
+    def write_video(self, name: str, gif: pathlib.Path, env_steps: int) -> None:
+        """Takes a video, a file that stays where it is."""
+
+    def close(self) -> None:
+        """Takes no more."""
 
 
 def is_count(name: str) -> bool:
@@ -107,6 +124,11 @@ def _finite_or_none(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
+def finite(entry: Line) -> Line:
+    """What is a number in a line."""
+    return {name: value for name, value in entry.items() if _finite_or_none(value) is not None}
+
+
 def read(path: str | os.PathLike[str]) -> list[Line]:
     """All complete lines of a `metrics.jsonl`; a half-written last one is left out."""
     lines = []
@@ -147,16 +169,16 @@ class Board:
 
     def write(self, entry: Line) -> None:
         """Adds what is a number in one line of metrics."""
-        finite = {k: v for k, v in entry.items() if _finite_or_none(v) is not None}
-        values = [Summary.Value(tag=name, simple_value=value) for name, value in finite.items()]
+        values = [Summary.Value(tag=k, simple_value=v) for k, v in finite(entry).items()]
         self._add(Event(step=entry["env_steps"], summary=Summary(value=values)))
         self._file.flush()
 
-    def write_video(self, name: str, gif: bytes, env_steps: int) -> None:
+    def write_video(self, name: str, gif: pathlib.Path, env_steps: int) -> None:
         """Adds an animated GIF in colour, which TensorBoard plays."""
-        width, height = struct.unpack("<HH", gif[6:10])  # as the format begins
+        data = gif.read_bytes()
+        width, height = struct.unpack("<HH", data[6:10])  # as the format begins
         image = Summary.Image(
-            height=height, width=width, colorspace=3, encoded_image_string=gif
+            height=height, width=width, colorspace=3, encoded_image_string=data
         )
         self._add(
             Event(step=env_steps, summary=Summary(value=[Summary.Value(tag=name, image=image)]))
@@ -172,27 +194,42 @@ class Board:
 
 
 class Tracker:
-    """Writes lines to `metrics.jsonl` and TensorBoard; a context manager.
+    """Writes lines to `metrics.jsonl`, TensorBoard and further backends; a context manager.
 
     Args:
       logdir: the folder of the run.
       purge_after: the last env step that TensorBoard keeps of what was written before;
         None keeps all.
+      further: backends that see to their own failures, as `vawm.backends.connect` makes them.
+      say: prints a warning.
 
     Raises:
       OSError: a file cannot be written, here and in every method.
     """
 
-    def __init__(self, logdir: pathlib.Path, *, purge_after: int | None = None):
-        self._logdir = logdir
-        self._file = (logdir / "metrics.jsonl").open("a")
-        self._board = Board(logdir, purge_after=purge_after)
+    def __init__(
+        self,
+        logdir: pathlib.Path,
+        *,
+        purge_after: int | None = None,
+        further: Sequence[Backend] = (),
+        say: Callable[[str], None] = print,
+    ):
+        self._logdir, self._further, self._say = logdir, further, say
+        self._file = (logdir / METRICS).open("a")
+        self._board: Board | None = None
+        try:
+            self._board = Board(logdir, purge_after=purge_after)
+        except Exception as error:
+            self._drop_board(error)
 
     def write(self, entry: Line) -> None:
         """Appends one line; it is in the files when this returns."""
         self._file.write(as_json(entry) + "\n")
         self._file.flush()
-        self._board.write(entry)
+        self._to_board(lambda board: board.write(entry))
+        for backend in self._further:
+            backend.write(entry)
 
     def write_videos(self, videos: Sequence[Video], *, env_steps: int) -> None:
         """Writes each as `videos/<name>-<env steps>.gif`, its numbers into `videos.jsonl`."""
@@ -207,7 +244,9 @@ class Tracker:
             except OSError:
                 scratch.unlink(missing_ok=True)
                 raise
-            self._board.write_video(f"video/{video.name}", gif, env_steps)
+            self._show(video.name, path, env_steps)
+            for backend in self._further:
+                backend.write_video(f"video/{video.name}", path, env_steps)
             entry = {"env_steps": env_steps, "video": path.name} | video.numbers
             with (self._logdir / VIDEO_LINES).open("a") as file:
                 file.write(as_json(entry) + "\n")
@@ -219,8 +258,27 @@ class Tracker:
         for entry in read(path) if path.exists() else ():
             video = self._logdir / VIDEOS / entry["video"]
             if entry["env_steps"] > after and video.exists():
-                name = entry["video"].partition("-")[0]
-                self._board.write_video(f"video/{name}", video.read_bytes(), entry["env_steps"])
+                self._show(entry["video"].partition("-")[0], video, entry["env_steps"])
+
+    def _show(self, name: str, gif: pathlib.Path, env_steps: int) -> None:
+        self._to_board(lambda board: board.write_video(f"video/{name}", gif, env_steps))
+
+    def _to_board(self, call: Callable[[Board], None]) -> None:
+        if self._board is not None:
+            try:
+                call(self._board)
+            except Exception as error:
+                self._drop_board(error)
+
+    def _drop_board(self, error: Exception) -> None:
+        """The run goes on without TensorBoard, unless its files cannot be written."""
+        if isinstance(error, OSError):
+            raise error
+        self._board = None
+        reason = (str(error).strip() or repr(error)).splitlines()[0][:200]
+        self._say(
+            f"warning: TensorBoard gets no more of this run ({reason}); {METRICS} has all"
+        )
 
     def __enter__(self) -> Tracker:
         return self
@@ -228,5 +286,7 @@ class Tracker:
     def __exit__(self, *_: object) -> None:
         try:
             self._file.close()
+            self._to_board(lambda board: board.close())
         finally:
-            self._board.close()
+            for backend in self._further:
+                backend.close()

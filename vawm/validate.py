@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
+import re
 import typing
 from collections.abc import Callable, Collection, Iterator
 from typing import Any
@@ -135,6 +136,7 @@ def _check_number(name: str, value: Any, kind: type) -> None:
 def _check_together(config: Config) -> None:
     _check_agent(config)
     _check_names(config)
+    _check_project(config.tracker_project)
     _check_widths(config)
     _check_imagination(config)
     _check_replay(config)
@@ -172,6 +174,13 @@ def _check_names(config: Config) -> None:
                 f"use config.with_size(..., {config.size!r}), or size={config_lib.CUSTOM!r}"
             )
             raise InvalidInput("size", config.size, remedy)
+
+
+def _check_project(name: Any) -> None:
+    """What is a name of a project, and of a file, everywhere."""
+    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}", name):
+        remedy = "use up to 100 letters, digits, '-', '_' and '.', a letter or digit first"
+        raise InvalidInput("tracker_project", name, remedy)
 
 
 def _check_widths(config: Config) -> None:
