@@ -83,6 +83,7 @@ HOST = {
     "command_line",
     "display",
     "evaluate",
+    "export",
     "flags",
     "manifest",
     "memory",
@@ -98,6 +99,7 @@ HOST = {
     "tracking",
     "validate",
     "video",
+    "weights",
 }
 SOLE_IMPORTERS = {"flax": {"nets"}, "distrax": {"distributions"}, "optax": {"learner", "optim"}}
 

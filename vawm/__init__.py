@@ -11,7 +11,7 @@
     vawm.evaluate, vawm.scores          protocols of the suites, and published scores
     vawm.analysis       what value alignment does, in numbers and pictures
     vawm.sweep          many runs of one program, tables and curves of them
-    vawm.load           a policy from a run's checkpoint
+    vawm.load           a policy from a run's checkpoint, or as vawm.export wrote it
 
 Importing the package imports none of them. `vawm.losses` imports neither networks nor
 environments; `vawm.envs` registers its tasks with Gymnasium.

@@ -71,6 +71,16 @@ def version() -> str:
         return "unknown"
 
 
+def spec_as_dict(spec: EnvSpec) -> dict[str, Any]:
+    """`spec`, ready for JSON."""
+    return spec._asdict() | {"obs": _obs_as_dict(spec.obs)}
+
+
+def spec_from_dict(content: dict[str, Any]) -> EnvSpec:
+    """The inverse of `spec_as_dict`."""
+    return EnvSpec(**content | {"obs": _obs_from_dict(content["obs"])})
+
+
 def leaf_info(leaf: Any) -> LeafInfo:
     """Shape and dtype of an array, of a `ShapeDtypeStruct` or of a typed PRNG key."""
     shape = tuple(leaf.shape)
@@ -119,7 +129,7 @@ def write(folder: pathlib.Path, manifest: Manifest) -> None:
     content = manifest._asdict() | {
         "schema": SCHEMA,
         "config": config_lib.as_dict(manifest.config),
-        "spec": manifest.spec._asdict() | {"obs": _obs_as_dict(manifest.spec.obs)},
+        "spec": spec_as_dict(manifest.spec),
         "leaves": {
             item: {path: info._asdict() for path, info in leaves.items()}
             for item, leaves in manifest.leaves.items()
@@ -161,12 +171,11 @@ def read(folder: pathlib.Path) -> Manifest:
     if content.pop("schema") != SCHEMA:
         remedy = f"was written by vawm {content['version']}, whose layout this one cannot read"
         raise InvalidInput("checkpoint", str(folder), remedy)
-    spec = content["spec"]
     return Manifest(
         version=content["version"],
         env_steps=content["env_steps"],
         config=config_from_dict(content["config"]),
-        spec=EnvSpec(**spec | {"obs": _obs_from_dict(spec["obs"])}),
+        spec=spec_from_dict(content["spec"]),
         progress=content["progress"],
         leaves={
             item: {path: _leaf_info(entry) for path, entry in leaves.items()}

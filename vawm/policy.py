@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple
 
 import jax
 
-from vawm import checkpoint
+from vawm import checkpoint, weights
 from vawm.agent import PolicyCarry, make_agent
 from vawm.config import Config
 from vawm.types import Array, EnvSpec, Key, Params, PyTree, TimeStep
@@ -48,11 +48,13 @@ class Policy(NamedTuple):
 
 
 def load(logdir: str | os.PathLike[str]) -> Policy:
-    """The policy in `logdir`; only what acting needs is read.
+    """The policy in `logdir`, of a run or as `vawm.export` wrote it; nothing else is read.
 
     Raises:
       InvalidInput: there is no checkpoint, or it is damaged.
     """
+    if weights.found(logdir):
+        return import_policy(logdir)
     _, manifest = checkpoint.read_manifest(logdir)
     agent = make_agent(manifest.config, manifest.spec)
     target = jax.eval_shape(agent.init, jax.random.key(0))
@@ -61,6 +63,27 @@ def load(logdir: str | os.PathLike[str]) -> Policy:
         config=manifest.config,
         spec=manifest.spec,
         env_steps=manifest.env_steps,
+        params=params,
+        state=state,
+        initial=agent.initial,
+        apply=jax.jit(agent.act, static_argnames="how"),
+    )
+
+
+def import_policy(folder: str | os.PathLike[str]) -> Policy:
+    """The policy that `vawm.export` wrote to `folder`, bit for bit that of the checkpoint.
+
+    Raises:
+      InvalidInput: a file is missing or damaged, or the weights are not those of its config.
+    """
+    description = weights.describe(folder)
+    agent = make_agent(description.config, description.spec)
+    target = jax.eval_shape(agent.init, jax.random.key(0))
+    params, state = weights.read(folder, description, *target)
+    return Policy(
+        config=description.config,
+        spec=description.spec,
+        env_steps=description.env_steps,
         params=params,
         state=state,
         initial=agent.initial,

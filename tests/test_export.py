@@ -1,0 +1,320 @@
+"""An exported policy: the same actions bit for bit, and a refusal for all that is not it."""
+
+import errno
+import json
+import os
+import pathlib
+import shutil
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import ml_dtypes
+import numpy as np
+import pytest
+import safetensors.numpy
+import tiny
+import toy
+
+import vawm
+from vawm import checkpoint, evaluate, export, policy, train, weights
+from vawm.agent import make_agent
+from vawm.checkpoint import SaveError
+from vawm.errors import InvalidInput
+from vawm.play import Score
+
+STEPS = 3
+
+
+@pytest.fixture(scope="module")
+def logdir(tmp_path_factory):
+    """A run with an untrained checkpoint at 32 env steps, and lines of metrics."""
+    folder = tmp_path_factory.mktemp("run")
+    env = tiny.env()
+    agent = make_agent(tiny.CONFIG, env.spec)
+    state = jax.jit(lambda key: train.init(env, agent, tiny.CONFIG, key))(jax.random.key(3))
+    checkpoint.save(folder, state, env_steps=32, config=tiny.CONFIG, spec=env.spec, progress={})
+    lines = [(16, 0.25, 3), (32, None, 0), (48, 9.0, 1)]
+    text = "".join(
+        json.dumps({"env_steps": s, "episode/return": r, "episode/count": n}) + "\n"
+        for s, r, n in lines
+    )
+    (folder / "metrics.jsonl").write_text(text)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def exported(logdir, tmp_path_factory):
+    return export.export(logdir, tmp_path_factory.mktemp("exports") / "policy")
+
+
+@pytest.fixture
+def copy(exported, tmp_path):
+    return shutil.copytree(exported, tmp_path / "policy")
+
+
+def test_the_weights_come_back_bit_for_bit(logdir, exported):
+    trained, loaded = policy.load(logdir), vawm.load(exported)
+    toy.assert_equal((loaded.params, loaded.state), (trained.params, trained.state))
+    assert loaded[:3] == trained[:3] == (tiny.CONFIG, tiny.env().spec, 32)
+    names = sorted(path.name for path in exported.iterdir())
+    assert names == ["README.md", "config.json", "model.safetensors"]
+    assert list(exported.parent.iterdir()) == [exported]
+
+
+ACT = """
+import pathlib, sys
+import jax, numpy as np, vawm
+from vawm import cache
+from vawm.types import TimeStep
+
+cache.enable()
+policy = vawm.load(sys.argv[1])
+carry, actions = policy.initial(2), []
+with np.load(sys.argv[2]) as seen:
+    steps = [TimeStep(*(seen[f"{name}{i}"] for name in TimeStep._fields)) for i in range(3)]
+for i, timestep in enumerate(steps):
+    carry, action = policy.act(jax.random.key(i), carry, timestep)
+    actions.append(action)
+np.save(sys.argv[3], np.stack(actions))
+"""
+
+
+def test_a_process_that_never_trained_acts_bit_for_bit_the_same(logdir, exported, tmp_path):
+    trained, env = policy.load(logdir), tiny.env()
+    env_state, timestep = env.reset(jax.random.key(7))
+    carry, actions, seen = trained.initial(2), [], {}
+    for i in range(STEPS):
+        seen |= {f"{name}{i}": np.asarray(x) for name, x in timestep._asdict().items()}
+        carry, action = trained.act(jax.random.key(i), carry, timestep)
+        actions.append(np.asarray(action))
+        env_state, timestep = env.step(env_state, action)
+    np.savez(tmp_path / "seen.npz", **seen)
+    moved = shutil.copytree(exported, tmp_path / "elsewhere")
+    path = str(pathlib.Path(vawm.__file__).parents[1])
+    files = [str(moved), str(tmp_path / "seen.npz"), str(tmp_path / "actions.npy")]
+    subprocess.run(
+        [sys.executable, "-c", ACT, *files],
+        env=os.environ | {"PYTHONPATH": path},
+        cwd=tmp_path,
+        check=True,
+        timeout=300,
+    )
+    there = np.load(tmp_path / "actions.npy")
+    assert np.abs(there).max() > 0
+    assert there.tobytes() == np.stack(actions).tobytes()
+
+
+@pytest.mark.parametrize("dtype", [jnp.bfloat16, jnp.float16, jnp.int32, bool])
+def test_every_dtype_and_the_state_of_a_world_model_are_kept(tmp_path, dtype):
+    params = {"a": {"b/c": jnp.arange(6).reshape(2, 3).astype(dtype)}, "scalar": jnp.float32(2)}
+    state = {"mean": jnp.arange(3.0), "empty": jnp.zeros((2, 0))}
+    spec, folder = tiny.env().spec, tmp_path / "policy"
+    weights.write(
+        folder, params, state, config=tiny.CONFIG, spec=spec, env_steps=1, card="a card"
+    )
+    description = weights.describe(folder)
+    assert (description.config, description.spec) == (tiny.CONFIG, spec)
+    shapes = jax.eval_shape(lambda: (params, state))
+    toy.assert_equal(weights.read(folder, description, *shapes), (params, state))
+
+
+def test_names_are_paths_and_nothing_is_pickled(exported):
+    stored = safetensors.numpy.load_file(exported / weights.MODEL)
+    assert all(name.startswith(("params.", "model_state")) for name in stored)
+    assert any(name.startswith("params.actor[") for name in stored)
+    size = json.loads((exported / weights.MODEL).read_bytes()[8:].split(b"}}")[0] + b"}}")
+    assert size["__metadata__"] == {"format": "np"}
+
+
+# The model card
+
+
+def test_the_card_says_what_was_trained_and_that_it_was_not_evaluated(exported):
+    text = (exported / weights.CARD).read_text()
+    for said in [
+        "| task | probe_observation_action (dmc_proprio) |",
+        "| agent | dreamerv3 |",
+        "| preset | custom |",
+        "| env steps | 32 of 96, action repeat 1 |",
+        "| seed | 0 |",
+        "| value alignment | weight 1 / max(1, KL) after a warm-up of 24 env steps |",
+        "Not evaluated. Last return of training: 0.2, the mean over 3 episodes that ended "
+        "shortly before 16 env steps",
+        "python -m vawm.evaluate --logdir FOLDER",
+        "Apache-2.0",
+    ]:
+        assert said in text, text
+
+
+def test_the_card_has_the_scores_of_an_evaluation_and_its_protocol(logdir, tmp_path):
+    folder = export.export(logdir, tmp_path / "policy", scores=Score((1.0, 3.0)))
+    text = (folder / weights.CARD).read_text()
+    assert "Evaluation: return 2.0 +- 1.0 over 2 episodes (whole episodes of 1000" in text
+    assert "Not evaluated" not in text
+
+
+def changed(**changes):
+    alignment = tiny.CONFIG.value_alignment
+    return tiny.config(value_alignment=type(alignment)(**changes))
+
+
+@pytest.mark.parametrize(
+    ("config", "expected"),
+    [
+        (changed(weight="off"), "off"),
+        (changed(weight="static", warmup_steps=8), "weight 0.5 after a warm-up of 8 env steps"),
+        (changed(), "not active yet: the warm-up of 10,000 env steps was not over"),
+        (
+            changed(warmup_unit="updates", warmup_steps=5),
+            "weight 1 / max(1, KL) after a warm-up of 5 updates",
+        ),
+    ],
+)
+def test_the_card_says_what_value_alignment_was(exported, config, expected):
+    text = export.card(vawm.load(exported)._replace(config=config), "")
+    assert f"| value alignment | {expected} |" in text
+
+
+# Refusals
+
+
+@pytest.mark.parametrize("kind", ["folder", "file"])
+def test_nothing_is_ever_overwritten(logdir, tmp_path, kind):
+    there = tmp_path / "there"
+    if kind == "folder":
+        there.mkdir()
+        (there / "mine").write_text("precious")
+    else:
+        there.write_text("precious")
+    with pytest.raises(InvalidInput, match=r"output=.*exists"):
+        export.export(logdir, there)
+    assert sum(path.is_file() for path in tmp_path.rglob("*")) == 1
+
+
+def test_an_empty_folder_is_taken(logdir, tmp_path):
+    (tmp_path / "policy").mkdir()
+    assert weights.found(export.export(logdir, tmp_path / "policy"))
+
+
+def test_a_full_disk_leaves_nothing(logdir, tmp_path, monkeypatch):
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(pathlib.Path, "write_text", full)
+    with pytest.raises(SaveError, match=r"could not be written: .*No space left"):
+        export.export(logdir, tmp_path / "policy")
+    assert not list(tmp_path.iterdir())
+
+
+def rewrite(folder, change):
+    """Replaces the weights, checksum included, by what `change` makes of them."""
+    stored = change(safetensors.numpy.load_file(folder / weights.MODEL))
+    safetensors.numpy.save_file(stored, folder / weights.MODEL)
+    content = json.loads((folder / weights.CONFIG).read_text())
+    content["sha256"] = weights.manifest_lib.sha256(folder / weights.MODEL)
+    (folder / weights.CONFIG).write_text(json.dumps(content))
+
+
+def first(stored):
+    return min(stored)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda s: {k: v for k, v in s.items() if k != first(s)}, "is missing, expected float"),
+        (lambda s: s | {"more": np.zeros(2, np.float32)}, r"more is float32\[2\], expected no"),
+        (
+            lambda s: s | {first(s): np.zeros((5, 7), np.float32)},
+            r"is float32\[5,7\], expected",
+        ),
+        (
+            lambda s: s | {first(s): s[first(s)].astype(ml_dtypes.bfloat16)},
+            r"is bfloat16\[.*\], expected float32",
+        ),
+        (lambda s: {k + "x": v for k, v in s.items()}, "and [0-9]+ more: these are not"),
+    ],
+)
+def test_weights_of_another_model_are_a_difference_in_one_line(copy, change, message):
+    rewrite(copy, change)
+    with pytest.raises(InvalidInput, match=message) as error:
+        vawm.load(copy)
+    assert "\n" not in str(error.value)
+
+
+def flip(data):
+    return data[:-2] + bytes([data[-2] ^ 1]) + data[-1:]
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        ("model.safetensors", flip, "does not match its checksum"),
+        ("model.safetensors", lambda data: data[:-8], "not fully covered"),
+        ("model.safetensors", lambda data: b"", "header too small"),
+        ("model.safetensors", None, "model.safetensors'"),
+        ("config.json", lambda data: data[:50], "is no description of a policy"),
+        ("config.json", lambda data: b"[]", "is no description of a policy"),
+        ("config.json", lambda data: b"\xff\xfe", "is no description of a policy"),
+        ("config.json", None, "is no description of a policy .No such file"),
+        ("config.json", lambda data: data.replace(b'"schema": 1', b'"schema": 2'), "layout"),
+        ("config.json", lambda data: data.replace(b'"seed": 0', b'"seed": -1'), "seed=-1"),
+        ("config.json", lambda data: data.replace(b'"seed"', b'"sede"'), "other version"),
+        ("config.json", lambda data: data.replace(b'"obs"', b'"abs"'), "KeyError"),
+    ],
+)
+def test_a_damaged_file_is_one_line(copy, name, change, message):
+    path = copy / name
+    if change is None:
+        path.unlink()
+    else:
+        path.write_bytes(change(path.read_bytes()))
+    with pytest.raises(InvalidInput, match=message) as error:
+        vawm.load(copy)
+    assert "\n" not in str(error.value)
+
+
+def test_a_folder_of_a_run_is_not_taken_for_an_export(logdir, tmp_path):
+    assert not weights.found(logdir)
+    assert not weights.found(tmp_path)
+    with pytest.raises(InvalidInput, match="holds no checkpoint"):
+        vawm.load(tmp_path)
+
+
+# The command line
+
+
+def test_the_command_line_evaluates_and_exports(logdir, tmp_path, monkeypatch, capsys):
+    asked = []
+
+    def fake(policy, **kwargs):
+        asked.append((policy.env_steps, kwargs))
+        return Score((1.0, 3.0))
+
+    monkeypatch.setitem(evaluate.PROTOCOLS, "dmc_proprio", fake)
+    monkeypatch.setattr(export.cache, "enable", lambda: None)
+    words = ["--logdir", str(logdir), "--output", str(tmp_path / "policy")]
+    assert export.main([*words, "--episodes", "2", "--seed", "5"]) == 0
+    assert asked == [(32, {"episodes": 2, "seed": 5})]
+    assert "return 2.0 +- 1.0 over 2 episodes" in capsys.readouterr().out
+    assert "2.0 +- 1.0" in (tmp_path / "policy" / weights.CARD).read_text()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--logdir", "."], "--output=None: is required"),
+        (["--logdir", ".", "--output", "."], "output='.': exists; choose another --output"),
+        (["--logdir", ".", "--output", "new"], "logdir='.': holds no checkpoint"),
+        (["--logdir", ".", "--output", "new", "--episodes", "-1"], "episodes=-1: use a whole"),
+    ],
+)
+def test_bad_input_is_one_line_and_code_2(tmp_path, monkeypatch, capsys, words, message):
+    (tmp_path / "mine").write_text("precious")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(export.cache, "enable", lambda: None)
+    assert export.guard(lambda: export.main(words)) == 2
+    assert capsys.readouterr().err.startswith(f"error: {message}")
+    assert [path.name for path in tmp_path.iterdir()] == ["mine"]

@@ -1,0 +1,199 @@
+"""A trained policy as a folder to share: weights, configuration, model card.
+
+    python -m vawm.export --logdir runs/... --output cartpole --episodes 10
+
+Five lines load it and act, wherever vawm is installed; no run and no checkpoint is needed:
+
+    import jax, vawm
+    policy = vawm.load("cartpole")
+    env = vawm.envs.make(policy.spec.task, num_envs=1, action_repeat=policy.spec.action_repeat)
+    _, timestep = env.reset(jax.random.key(0))
+    carry, action = policy.act(jax.random.key(1), policy.initial(1), timestep)
+
+`python -m vawm.evaluate --logdir cartpole` evaluates it. The files are those of `vawm.weights`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import pathlib
+import sys
+from collections.abc import Sequence
+
+from vawm import cache, evaluate, flags, huge_pages, tracking, weights
+from vawm import manifest as manifest_lib
+from vawm import policy as policy_lib
+from vawm.agent import parameter_count
+from vawm.command_line import guard
+from vawm.config import Config
+from vawm.play import Score
+from vawm.policy import Policy
+
+PROTOCOLS = {
+    "dmc_proprio": "whole episodes of 1000 control steps, simulated on MJX as in training",
+    "dmc_vision": "whole episodes of 1000 control steps, rendered as in training",
+    "atari100k": "whole games with their whole scores, without sticky actions",
+    "gymnasium": "whole episodes of the registered environment",
+}
+"""Suite -> what `vawm.evaluate` plays, for the model card."""
+
+
+def export(
+    logdir: str | os.PathLike[str],
+    folder: str | os.PathLike[str],
+    *,
+    scores: Score | None = None,
+    protocol: str = "",
+) -> pathlib.Path:
+    """Writes the policy of the newest checkpoint in `logdir` to `folder`.
+
+    Args:
+      logdir: folder of a run.
+      folder: not there yet, or empty.
+      scores: of an evaluation; without them the model card has the last return of training.
+      protocol: how they were obtained; that of the suite, with sampled actions, if not given.
+
+    Returns:
+      The folder.
+
+    Raises:
+      InvalidInput: no checkpoint, or a folder that is not empty; nothing was written.
+      SaveError: the disk is full; nothing is left behind.
+    """
+    logdir, folder = pathlib.Path(logdir).expanduser(), pathlib.Path(folder).expanduser()
+    weights.check_output(folder)
+    policy = policy_lib.load(logdir)
+    measured = _last_return(logdir, policy.env_steps)
+    if scores is not None:
+        protocol = protocol or f"{PROTOCOLS[policy.config.suite]}; actions sampled"
+        measured = f"Evaluation: return {scores} ({protocol}), mean +- standard error."
+    weights.write(
+        folder,
+        policy.params,
+        policy.state,
+        config=policy.config,
+        spec=policy.spec,
+        env_steps=policy.env_steps,
+        card=card(policy, measured),
+    )
+    return folder
+
+
+def _last_return(logdir: pathlib.Path, env_steps: int) -> str:
+    """What training measured last, and that it is no evaluation."""
+    path = logdir / tracking.METRICS
+    lines = [
+        entry
+        for entry in (tracking.read(path) if path.exists() else [])
+        if entry["env_steps"] <= env_steps and entry.get("episode/return") is not None
+    ]
+    if not lines:
+        return "Not evaluated, and no episode of training has a recorded return."
+    last = lines[-1]
+    return (
+        f"Not evaluated. Last return of training: {last['episode/return']:.1f}, the mean over "
+        f"{last['episode/count']} episodes that ended shortly before {last['env_steps']} env "
+        "steps, with the rewards and the exploration of training."
+    )
+
+
+def card(policy: Policy, measured: str) -> str:
+    """The text of `README.md`; `measured` says what the policy scores and how that is known."""
+    config, spec = policy.config, policy.spec
+    rows = {
+        "task": f"{spec.task} ({config.suite})",
+        "agent": config.agent,
+        "size": f"{config.size}, {parameter_count(policy.params):,} parameters",
+        "preset": config.preset,
+        "env steps": f"{policy.env_steps:,} of {config.env_steps:,}, "
+        f"action repeat {spec.action_repeat}",
+        "seed": config.seed,
+        "value alignment": _alignment(config, policy.env_steps),
+        "written by": f"vawm {manifest_lib.version()}",
+    }
+    table = "\n".join(f"| {name} | {value} |" for name, value in rows.items())
+    return f"""---
+license: apache-2.0
+library_name: vawm
+tags: [reinforcement-learning, world-model, jax]
+---
+
+# {spec.task}, {config.agent}
+
+| | |
+|---|---|
+{table}
+
+## Score
+
+{measured}
+
+## Use
+
+```python
+import jax, vawm
+
+policy = vawm.load("FOLDER")  # this one
+carry = policy.initial(1)
+carry, action = policy.act(jax.random.key(0), carry, timestep)  # for every vawm.types.TimeStep
+```
+
+Evaluate it with `python -m vawm.evaluate --logdir FOLDER`. All choices of the training are in
+`{weights.CONFIG}`.
+
+## Licence
+
+Apache-2.0, as vawm itself.
+"""
+
+
+def _alignment(config: Config, env_steps: int) -> str:
+    """Whether L_var was part of what was learned."""
+    alignment = config.value_alignment
+    if alignment.weight == "off":
+        return "off"
+    warmup, unit = alignment.warmup_steps, alignment.warmup_unit.replace("_", " ")
+    if alignment.warmup_unit == "env_steps" and env_steps <= warmup:
+        return f"not active yet: the warm-up of {warmup:,} env steps was not over"
+    weight = {
+        "adaptive": "weight 1 / max(1, KL)",
+        "static": f"weight {alignment.static_weight:g}",
+    }[alignment.weight]
+    return f"{weight} after a warm-up of {warmup:,} {unit}"
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Write the policy of a run's newest checkpoint to a folder of its own."""
+
+    logdir: pathlib.Path
+    """folder of the run"""
+    output: pathlib.Path
+    """folder to write; not there yet, or empty"""
+    episodes: int = 0
+    """play so many by the protocol of the suite, for the model card; 0 for none"""
+    seed: int = 0
+    """of these episodes"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Prints where the policy is; returns the exit code."""
+    arguments = flags.read(Arguments, argv, description=__doc__)
+    weights.check_output(arguments.output.expanduser())
+    evaluate.check(arguments.episodes or 1, arguments.seed)
+    scores = None
+    if arguments.episodes:
+        cache.enable()
+        policy = policy_lib.load(arguments.logdir)
+        protocol = evaluate.PROTOCOLS[policy.config.suite]
+        scores = protocol(policy, episodes=arguments.episodes, seed=arguments.seed)
+    folder = export(arguments.logdir, arguments.output, scores=scores)
+    print(f"exported to {folder}" + (f", return {scores}" if scores else ""))
+    print(f"evaluate with: python -m vawm.evaluate --logdir {folder}")
+    return 0
+
+
+if __name__ == "__main__":
+    huge_pages.use_huge_pages()
+    sys.exit(guard(main))
