@@ -118,6 +118,8 @@ def test_every_dtype_and_the_state_of_a_world_model_are_kept(tmp_path, dtype):
     assert (description.config, description.spec) == (tiny.CONFIG, spec)
     shapes = jax.eval_shape(lambda: (params, state))
     toy.assert_equal(weights.read(folder, description, *shapes), (params, state))
+    with pytest.raises(InvalidInput, match=r"output=.*exists"):
+        weights.write(folder, {}, {}, config=tiny.CONFIG, spec=spec, env_steps=1, card="")
 
 
 def test_names_are_paths_and_nothing_is_pickled(exported):

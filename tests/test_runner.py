@@ -17,7 +17,7 @@ import toy
 from runs import assert_same, events, lines, measured, quiet
 from tensorboardX.proto.event_pb2 import SessionLog
 
-from vawm import checkpoint, envs, memory, runner
+from vawm import backends, checkpoint, envs, memory, runner
 from vawm.errors import InvalidInput
 from vawm.program import Program
 from vawm.runner import RunError
@@ -101,6 +101,23 @@ def test_a_run_leaves_its_config_a_checkpoint_and_advice(tmp_path, fake):
     assert f"vawm.evaluate.evaluate(vawm.load({str(tmp_path)!r})" in console.file.getvalue()
     resumption = f"vawm.runner.run(config, {str(tmp_path)!r}, env=..., resume=True), its env_st"
     assert f"go on with: {resumption}" in console.file.getvalue()
+
+
+def test_a_tracker_that_fails_changes_nothing_but_one_line_of_output(
+    tmp_path, fake, monkeypatch
+):
+    def unreachable(*_):
+        raise ConnectionError("unreachable")
+
+    fake()
+    monkeypatch.setitem(backends.OPENERS, "wandb", unreachable)
+    monkeypatch.setattr(backends, "check", lambda _: None)
+    console = quiet()
+    run(tiny.config(tracker="wandb"), tmp_path / "with", console=console)
+    run(tiny.CONFIG, tmp_path / "without")
+    assert console.file.getvalue().count("warning: wandb gets no more") == 1
+    assert measured(tmp_path / "with") == measured(tmp_path / "without")
+    assert checkpoint.latest(tmp_path / "with").name == "000000000096"
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
