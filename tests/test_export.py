@@ -60,6 +60,7 @@ def test_the_weights_come_back_bit_for_bit(logdir, exported):
     assert loaded[:3] == trained[:3] == (tiny.CONFIG, tiny.env().spec, 32)
     names = sorted(path.name for path in exported.iterdir())
     assert names == ["README.md", "config.json", "model.safetensors"]
+    assert len({path.stat().st_mode for path in exported.iterdir()}) == 1
     assert list(exported.parent.iterdir()) == [exported]
 
 
@@ -193,6 +194,15 @@ def test_nothing_is_ever_overwritten(logdir, tmp_path, kind):
     with pytest.raises(InvalidInput, match=r"output=.*exists"):
         export.export(logdir, there)
     assert sum(path.is_file() for path in tmp_path.rglob("*")) == 1
+
+
+def test_a_config_that_could_not_be_loaded_is_not_written(tmp_path):
+    config, spec = tiny.config(seed=-1), tiny.env().spec
+    with pytest.raises(InvalidInput, match="seed=-1"):
+        weights.write(
+            tmp_path / "policy", {}, {}, config=config, spec=spec, env_steps=1, card=""
+        )
+    assert not list(tmp_path.iterdir())
 
 
 def test_an_empty_folder_is_taken(logdir, tmp_path):

@@ -106,10 +106,12 @@ def write(
     """Writes the three files under a temporary name, which becomes `folder` at the end.
 
     Raises:
-      InvalidInput: `folder` exists and is not empty.
+      InvalidInput: `folder` exists and is not empty, or `read` would refuse the config.
       SaveError: the disk is full; nothing is left behind.
     """
     check_output(folder)
+    validate.check(config)
+    validate.check_spec(config, spec)
     leaves = {name: np.asarray(leaf) for name, leaf in _flatten(params, state).items()}
     scratch = folder.absolute().with_name(f".{folder.name}.tmp-{os.getpid()}")
     content = {
@@ -126,6 +128,7 @@ def write(
         content["sha256"] = manifest_lib.sha256(scratch / MODEL)
         (scratch / CONFIG).write_text(json.dumps(content, indent=2) + "\n")
         (scratch / CARD).write_text(card)
+        (scratch / MODEL).chmod((scratch / CARD).stat().st_mode)  # the library's is 0600
         for name in (CONFIG, CARD):
             manifest_lib.sha256(scratch / name)  # on the disk when this returns
         scratch.replace(folder.absolute())
