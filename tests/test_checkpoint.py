@@ -12,21 +12,15 @@ import tiny
 import toy
 
 from vawm import checkpoint, manifest
+from vawm import config as config_lib
 from vawm.errors import InvalidInput
 
 PROGRESS = {"env_steps": 8, "seconds": 1 / 3}
 
 
 def save(logdir, state, env_steps=8, **changes):
-    return checkpoint.save(
-        logdir,
-        state,
-        env_steps=env_steps,
-        config=tiny.CONFIG,
-        spec=toy.SPEC,
-        progress=PROGRESS,
-        **changes,
-    )
+    usual = {"config": tiny.CONFIG, "spec": toy.SPEC, "progress": PROGRESS}
+    return checkpoint.save(logdir, state, env_steps=env_steps, **usual | changes)
 
 
 def files_of(path):
@@ -186,10 +180,17 @@ def test_damage_to_any_file_is_told_by_its_name(tmp_path, harm):
         shutil.rmtree(tmp_path / "copy")
 
 
-def test_only_the_newest_is_kept(tmp_path):
+@pytest.mark.parametrize("keep", [1, 2])
+def test_as_many_as_asked_for_are_kept_the_newest_ones(tmp_path, keep):
     for env_steps in (8, 16, 120):
-        save(tmp_path, toy.state(env_steps), env_steps)
-    assert [path.name for path in checkpoint.root(tmp_path).iterdir()] == ["000000000120"]
+        save(
+            tmp_path,
+            toy.state(env_steps),
+            env_steps,
+            config=tiny.config(keep_checkpoints=keep),
+        )
+    names = sorted(path.name for path in checkpoint.root(tmp_path).iterdir())
+    assert names == ["000000000016", "000000000120"][-keep:]
     restored, _ = checkpoint.restore(tmp_path, toy.state())
     toy.assert_equal(restored, toy.state(120))
 
@@ -199,7 +200,7 @@ def test_an_unfinished_checkpoint_is_ignored_and_swept_away(tmp_path):
     shutil.copytree(first, first.with_name(checkpoint.SCRATCH + "000000000016"))
     assert checkpoint.latest(tmp_path) == first
     second = save(tmp_path, toy.state(), 24)
-    assert list(checkpoint.root(tmp_path).iterdir()) == [second]
+    assert set(checkpoint.root(tmp_path).iterdir()) == {first, second}
 
 
 def test_a_full_disk_leaves_the_previous_checkpoint_alone(tmp_path, monkeypatch):
@@ -233,7 +234,7 @@ def test_no_checkpoint_is_said(tmp_path):
 
 
 def test_a_config_survives_json():
-    content = checkpoint.manifest_lib.config_lib.as_dict(tiny.CONFIG)
+    content = config_lib.as_dict(tiny.CONFIG)
     assert manifest.config_from_dict(content) == tiny.CONFIG
     with pytest.raises(InvalidInput, match=r"Config\.colour=.*not known"):
         manifest.config_from_dict(content | {"colour": 1})

@@ -34,6 +34,7 @@ class Arguments(NamedTuple):
     config: Config
     logdir: pathlib.Path
     resume: bool
+    fresh: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,6 +46,8 @@ class Flags:
     """folder of the run; `runs/<suite>/<task>/<preset>-seed<seed>-<time>` if not given"""
     resume: bool = False
     """continue the run in --logdir, with its own settings as defaults"""
+    fresh: bool = False
+    """start over in --logdir; what is there is moved into a folder replaced-1, -2 ... in it"""
 
 
 def train(
@@ -56,13 +59,15 @@ def train(
 ) -> int:
     """What an experiment does: reads its command line and trains; returns the exit code."""
     arguments = parse(argv, suite=suite, description=description, aliases=aliases)
-    runner.check(arguments.config, arguments.logdir, resume=arguments.resume)
+    config, logdir = arguments.config, arguments.logdir
+    runner.check(config, logdir, resume=arguments.resume, fresh=arguments.fresh)
     cache.enable()
     result = runner.run(
-        arguments.config,
-        arguments.logdir,
+        config,
+        logdir,
         resume=arguments.resume,
-        banner=describe(arguments.config),
+        fresh=arguments.fresh,
+        banner=describe(config),
         command=f"python {pathlib.Path(sys.argv[0])}",
     )
     return result.exit_code
@@ -98,7 +103,7 @@ def parse(
     if config.suite != suite:
         remedy = f"this program runs suite {suite}; use the one of that suite"
         raise InvalidInput("suite", config.suite, remedy)
-    return Arguments(config, flags.logdir or default_logdir(config), flags.resume)
+    return Arguments(config, flags.logdir or default_logdir(config), flags.resume, flags.fresh)
 
 
 def _without_alias(word: str, aliases: Mapping[str, str]) -> str:

@@ -425,6 +425,10 @@ class Config:
     """env steps between lines of metrics.jsonl"""
     save_every: int = 50_000
     """env steps between checkpoints"""
+    save_minutes: float = 10.0
+    """minutes after which there is one as well; 0 for never"""
+    keep_checkpoints: int = 2
+    """the newest ones; older ones are deleted"""
     world_model: WorldModelConfig = field(default_factory=RSSMConfig)
     actor: ActorConfig = field(default_factory=ActorConfig)
     critic: CriticConfig = field(default_factory=CriticConfig)

@@ -9,7 +9,10 @@ import json
 import math
 import os
 import pathlib
+import re
+import stat
 import typing
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -17,12 +20,39 @@ import jax.numpy as jnp
 import numpy as np
 
 from vawm import config as config_lib
+from vawm import validate
 from vawm.config import Config
 from vawm.errors import InvalidInput
 from vawm.types import ArraySpec, EnvSpec, PyTree
 
 SCHEMA = 1
 NAME, DIGEST = "manifest.json", "manifest.sha256"
+EPISODES = "episodes"
+ITEMS = ("params", "model_state", "images", "state", EPISODES)
+"""The folders of a checkpoint."""
+DTYPES = (
+    *("bool", "bfloat16", "float16", "float32", "float64"),
+    *("int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64"),
+)
+MAX_BYTES = 2**24
+"""Of a manifest; that of a run has some 100 bytes per leaf and file."""
+MAX_AXES = 32
+FILE_FACTOR, FILE_BYTES, LEAF_BYTES = 2, 2**20, 2**16
+"""What the files of an item may take: twice its leaves, and this much whatever their size."""
+MAX_EPISODES_BYTES = 2**32
+"""Of running episodes, whose shapes nothing but the manifest tells."""
+
+
+class Damaged(InvalidInput):
+    """A file of a checkpoint that cannot be trusted: `path`, and `how` that is known."""
+
+    def __init__(self, path: pathlib.Path, how: str):
+        remedy = (
+            f"{how}; the checkpoint is damaged: restore it from a copy, or start the run over "
+            "with --fresh"
+        )
+        super().__init__("checkpoint", str(path), remedy)
+        self.path, self.how = path, how
 
 
 class LeafInfo(NamedTuple):
@@ -77,8 +107,11 @@ def spec_as_dict(spec: EnvSpec) -> dict[str, Any]:
 
 
 def spec_from_dict(content: dict[str, Any]) -> EnvSpec:
-    """The inverse of `spec_as_dict`."""
-    return EnvSpec(**content | {"obs": _obs_from_dict(content["obs"])})
+    """The inverse of `spec_as_dict`; ValueError or TypeError where it is none."""
+    kinds = {"task": str, "obs": dict, "action_size": int, "discrete": bool}
+    kinds |= {"num_envs": int, "action_repeat": int, "episode_length": (int, type(None))}
+    spec = _record(content, kinds)
+    return EnvSpec(**spec | {"obs": _obs_from_dict(spec["obs"])})
 
 
 def leaf_info(leaf: Any) -> LeafInfo:
@@ -96,11 +129,13 @@ def config_from_dict(content: dict[str, Any], cls: type = Config) -> Any:
     Raises:
       InvalidInput: a field is missing or unknown, as after a change of version.
     """
+    if not isinstance(content, dict):
+        raise InvalidInput(cls.__name__, str(content)[:40], "holds no choices")
     names = {field.name for field in dataclasses.fields(cls)}
-    for name in names ^ content.keys():
+    for name in sorted(names ^ content.keys()):
         verb = "was not saved" if name in names else "is not known"
         raise InvalidInput(
-            f"{cls.__name__}.{name}", content.get(name), f"{verb} (other version)"
+            f"{cls.__name__}.{name[:40]}", content.get(name), f"{verb} (other version)"
         )
     hints = typing.get_type_hints(cls)
     if cls is Config:
@@ -108,7 +143,7 @@ def config_from_dict(content: dict[str, Any], cls: type = Config) -> Any:
             ("suite", config_lib.ENV_CONFIGS),
             ("agent", config_lib.AGENT_CONFIGS),
         ):
-            if content[name] not in known:
+            if not isinstance(content[name], str) or content[name] not in known:
                 raise InvalidInput(
                     f"Config.{name}", content[name], "is not known (other version)"
                 )
@@ -118,14 +153,26 @@ def config_from_dict(content: dict[str, Any], cls: type = Config) -> Any:
         **{
             name: config_from_dict(value, hints[name])
             if dataclasses.is_dataclass(hints[name])
-            else value
+            else _choice(f"{cls.__name__}.{name}", value, hints[name])
             for name, value in content.items()
         }
     )
 
 
-def write(folder: pathlib.Path, manifest: Manifest) -> None:
-    """Writes the manifest into `folder` with the checksums of all files found there."""
+def _choice(name: str, value: Any, hint: Any) -> Any:
+    """`value`, of the kind that the field has; what it may be is for `validate`."""
+    kinds = {float: (int, float)}.get(hint, (hint,) if isinstance(hint, type) else (str,))
+    if not isinstance(value, kinds) or (isinstance(value, bool) and hint is not bool):
+        raise InvalidInput(name, str(value)[:40], "is of another kind (other version)")
+    return value
+
+
+def write(folder: pathlib.Path, manifest: Manifest) -> int:
+    """Writes the manifest into `folder` with the checksums of all files found there.
+
+    Returns:
+      the bytes of all these files.
+    """
     content = manifest._asdict() | {
         "schema": SCHEMA,
         "config": config_lib.as_dict(manifest.config),
@@ -145,6 +192,7 @@ def write(folder: pathlib.Path, manifest: Manifest) -> None:
     (folder / DIGEST).write_text(hashlib.sha256(text).hexdigest() + "\n")
     for name in (NAME, DIGEST):
         sha256(folder / name)
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
 
 
 def sha256(path: pathlib.Path) -> str:
@@ -155,34 +203,148 @@ def sha256(path: pathlib.Path) -> str:
 
 
 def read(folder: pathlib.Path) -> Manifest:
-    """The manifest in `folder`.
+    """The manifest in `folder`; nothing that it names is looked at.
 
     Raises:
-      InvalidInput: it is missing, damaged, or of another layout.
+      Damaged: it is missing, changed, too large, or describes no checkpoint of ours.
+      InvalidInput: another version wrote it, or its config could not be run.
     """
-    for name in (NAME, DIGEST):
-        if not (folder / name).is_file():
-            raise damaged(folder / name, "is missing")
-    text = (folder / NAME).read_bytes()
-    digest = (folder / DIGEST).read_bytes().strip()
-    if hashlib.sha256(text).hexdigest().encode() != digest:
-        raise damaged(folder / NAME, f"does not match {DIGEST}")
-    content = json.loads(text)
-    if content.pop("schema") != SCHEMA:
-        remedy = f"was written by vawm {content['version']}, whose layout this one cannot read"
-        raise InvalidInput("checkpoint", str(folder), remedy)
+    digest, text = _content(folder / DIGEST, 1024), _content(folder / NAME, MAX_BYTES)
+    if not re.fullmatch(rb"[0-9a-f]{64}\n", digest):
+        raise Damaged(folder / DIGEST, "is not a checksum")
+    if hashlib.sha256(text).hexdigest().encode() != digest.strip():
+        raise Damaged(folder / NAME, f"does not match {DIGEST}")
+    try:
+        content = _record(json.loads(text), {"schema": int, "version": str}, whole=False)
+        if content["schema"] != SCHEMA:
+            written = content["version"][:40]
+            remedy = f"was written by vawm {written}, whose layout this one cannot read"
+            raise InvalidInput("checkpoint", str(folder), remedy)
+        manifest = _parse(content)
+    except InvalidInput:
+        raise
+    except (ValueError, TypeError, RecursionError) as error:
+        reason = "nested too deep" if isinstance(error, RecursionError) else _first_line(error)
+        raise Damaged(folder / NAME, f"is not a manifest: {reason}") from error
+    validate.check(manifest.config)
+    return manifest
+
+
+def _content(path: pathlib.Path, limit: int) -> bytes:
+    """What is in a small regular file."""
+    try:
+        status = path.lstat()
+        if not stat.S_ISREG(status.st_mode):
+            raise Damaged(path, "is not a file")
+        if status.st_size > limit:
+            raise Damaged(path, f"has {status.st_size} bytes, more than the {limit} allowed")
+        return path.read_bytes()
+    except OSError as error:
+        missing = isinstance(error, FileNotFoundError)
+        how = "is missing" if missing else f"cannot be read ({error.strerror})"
+        raise Damaged(path, how) from error
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip() or repr(error)).splitlines()[0][:200]
+
+
+def _parse(content: dict[str, Any]) -> Manifest:
+    """The manifest in plain JSON; ValueError or TypeError where it is none."""
+    kinds = {"schema": int, "version": str, "env_steps": int}
+    kinds |= dict.fromkeys(("config", "spec", "progress", "leaves", "files"), dict)
+    _record(content, kinds)
+    leaves = {item: _leaves(item, entries) for item, entries in content["leaves"].items()}
+    files = {name: _file(name, entry, leaves) for name, entry in content["files"].items()}
+    _check_sizes(leaves, files)
     return Manifest(
         version=content["version"],
-        env_steps=content["env_steps"],
+        env_steps=_count(content["env_steps"]),
         config=config_from_dict(content["config"]),
         spec=spec_from_dict(content["spec"]),
         progress=content["progress"],
-        leaves={
-            item: {path: _leaf_info(entry) for path, entry in leaves.items()}
-            for item, leaves in content["leaves"].items()
-        },
-        files={path: (size, digest) for path, (size, digest) in content["files"].items()},
+        leaves=leaves,
+        files=files,
     )
+
+
+def _record(
+    content: Any, kinds: Mapping[str, type | tuple[type, ...]], *, whole: bool = True
+) -> dict[str, Any]:
+    """`content`, a dict whose values are of these kinds, with no others if `whole`."""
+    if not isinstance(content, dict):
+        raise ValueError(f"{str(content)[:40]!r} where {', '.join(kinds)} are expected")
+    for name in kinds.keys() - content.keys():
+        raise ValueError(f"{name} is missing")
+    for name in content.keys() - kinds.keys() if whole else ():
+        raise ValueError(f"{name[:40]!r} is not known")
+    for name, kind in kinds.items():
+        value = content[name]
+        if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
+            raise ValueError(f"{name} is {str(value)[:40]!r}")
+    return content
+
+
+def _count(value: Any) -> int:
+    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 2**63:
+        raise ValueError(f"{str(value)[:40]!r} is not a count")
+    return value
+
+
+def _shape(value: Any) -> tuple[int, ...]:
+    if not isinstance(value, list) or len(value) > MAX_AXES:
+        raise ValueError(f"{str(value)[:40]!r} is not a shape")
+    return tuple(_count(size) for size in value)
+
+
+def _leaves(item: str, entries: Any) -> dict[str, LeafInfo]:
+    if item not in ITEMS:
+        raise ValueError(f"item {item[:40]!r} is not known")
+    if not isinstance(entries, dict):
+        raise ValueError(f"item {item} has no leaves")
+    return {path: _leaf_info(entry) for path, entry in entries.items()}
+
+
+def _leaf_info(entry: Any) -> LeafInfo:
+    _record(entry, {"shape": list, "dtype": str, "impl": (str, type(None))})
+    dtype, impl = entry["dtype"], entry["impl"]
+    is_key = impl is not None and impl == dtype and re.fullmatch(r"key<\w{1,20}>", dtype)
+    if not (is_key or (impl is None and dtype in DTYPES)):
+        raise ValueError(f"dtype {dtype[:40]!r} is not known")
+    return LeafInfo(_shape(entry["shape"]), dtype, impl)
+
+
+def _file(name: str, entry: Any, leaves: Mapping[str, Any]) -> tuple[int, str]:
+    path = pathlib.PurePosixPath(name)
+    if path.is_absolute() or ".." in path.parts or "\0" in name or str(path) != name:
+        raise ValueError(f"file {name[:80]!r} is outside of the checkpoint")
+    if item_of(name) not in leaves or len(path.parts) < 2:
+        raise ValueError(f"file {name[:80]!r} belongs to no item")
+    if not isinstance(entry, list) or len(entry) != 2:
+        raise ValueError(f"file {name[:80]!r} has no size and checksum")
+    size, digest = entry
+    if not isinstance(digest, str) or not re.fullmatch("[0-9a-f]{64}", digest):
+        raise ValueError(f"file {name[:80]!r} has no checksum")
+    return _count(size), digest
+
+
+def _check_sizes(
+    leaves: Mapping[str, Mapping[str, LeafInfo]], files: Mapping[str, tuple[int, str]]
+) -> None:
+    """No item takes more of the disk than its leaves can need, compressed or not."""
+    for item, infos in leaves.items():
+        needed = sum(info.nbytes for info in infos.values())
+        limit = FILE_FACTOR * needed + FILE_BYTES + LEAF_BYTES * len(infos)
+        total = sum(size for name, (size, _) in files.items() if item_of(name) == item)
+        if total > limit:
+            raise ValueError(f"{total} bytes of {item}, whose leaves need {limit} at most")
+        if item == EPISODES and needed > MAX_EPISODES_BYTES:
+            raise ValueError(f"{needed} bytes of {item}, {MAX_EPISODES_BYTES} are allowed")
+
+
+def item_of(name: str) -> str:
+    """The item that a file of a checkpoint belongs to."""
+    return pathlib.PurePosixPath(name).parts[0] if name else ""
 
 
 def _obs_as_dict(obs: PyTree) -> dict[str, Any]:
@@ -192,36 +354,12 @@ def _obs_as_dict(obs: PyTree) -> dict[str, Any]:
     return {"shape": list(obs.shape), "dtype": str(jnp.dtype(obs.dtype))}
 
 
-def _obs_from_dict(content: dict[str, Any]) -> PyTree:
+def _obs_from_dict(content: Any) -> PyTree:
     """The inverse of `_obs_as_dict`."""
-    if "entries" in content:
-        return {name: _obs_from_dict(entry) for name, entry in content["entries"].items()}
-    return ArraySpec(tuple(content["shape"]), jnp.dtype(content["dtype"]))
-
-
-def _leaf_info(entry: dict[str, Any]) -> LeafInfo:
-    return LeafInfo(tuple(entry["shape"]), entry["dtype"], entry["impl"])
-
-
-def verify(folder: pathlib.Path, manifest: Manifest, item: str) -> None:
-    """Compares every file of `item` with its checksum.
-
-    Raises:
-      InvalidInput: the first file that is missing, cut short or changed.
-    """
-    for name, (size, digest) in manifest.files.items():
-        path = folder / name
-        if pathlib.PurePosixPath(name).parts[0] != item:
-            continue
-        if not path.is_file():
-            raise damaged(path, "is missing")
-        if path.stat().st_size != size:
-            raise damaged(path, f"has {path.stat().st_size} bytes instead of {size}")
-        if sha256(path) != digest:
-            raise damaged(path, "does not match its checksum")
-
-
-def damaged(path: pathlib.Path, how: str) -> InvalidInput:
-    """The error for a file of a checkpoint that cannot be trusted."""
-    remedy = f"{how}; the checkpoint is damaged, restore it from a copy or start a new run"
-    return InvalidInput("checkpoint", str(path), remedy)
+    if isinstance(content, dict) and "entries" in content:
+        entries = _record(content, {"entries": dict})["entries"]
+        return {name: _obs_from_dict(entry) for name, entry in entries.items()}
+    _record(content, {"shape": list, "dtype": str})
+    if content["dtype"] not in DTYPES:
+        raise ValueError(f"dtype {content['dtype'][:40]!r} is not known")
+    return ArraySpec(_shape(content["shape"]), jnp.dtype(content["dtype"]))

@@ -8,14 +8,14 @@ from typing import Literal, NamedTuple
 
 import jax
 
-from vawm import checkpoint, weights
+from vawm import checkpoint, validate, weights
 from vawm.agent import PolicyCarry, make_agent
 from vawm.config import Config
 from vawm.types import Array, EnvSpec, Key, Params, PyTree, TimeStep
 
 
 class Policy(NamedTuple):
-    """The newest checkpoint of a run, without what only training needs.
+    """A checkpoint of a run, the newest that is whole, without what only training needs.
 
     Attributes:
       config: of the run.
@@ -50,15 +50,20 @@ class Policy(NamedTuple):
 def load(logdir: str | os.PathLike[str]) -> Policy:
     """The policy in `logdir`, of a run or as `vawm.export` wrote it; nothing else is read.
 
+    Where that is damaged, the newest older one that is whole is loaded, and the log of `vawm`
+    says so.
+
     Raises:
-      InvalidInput: there is no checkpoint, or it is damaged.
+      InvalidInput: there is no checkpoint, or all are damaged.
     """
     if weights.found(logdir):
         return import_policy(logdir)
-    _, manifest = checkpoint.read_manifest(logdir)
+    found = checkpoint.usable(logdir, checkpoint.ACTING)
+    manifest = found.manifest
+    validate.check_spec(manifest.config, manifest.spec)
     agent = make_agent(manifest.config, manifest.spec)
     target = jax.eval_shape(agent.init, jax.random.key(0))
-    (params, state), manifest = checkpoint.restore_agent(logdir, *target)
+    params, state = checkpoint.read_agent(found, *target)
     return Policy(
         config=manifest.config,
         spec=manifest.spec,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pathlib
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +18,7 @@ from vawm.replay import Replay
 from vawm.types import PyTree
 
 MAY_DIFFER = (
-    *("env_steps", "log_every", "save_every"),
+    *("env_steps", "log_every", "save_every", "save_minutes", "keep_checkpoints"),
     *("video.every", "video.sequences", "video.context", "video.episode_steps"),
     *("env.workers", "env.timeout", "env.on_failure"),
     *("tracker", "tracker_project"),
@@ -29,13 +30,13 @@ def saved_config(logdir: str | os.PathLike[str]) -> Config:
     """The choices of the run in `logdir`: of its newest checkpoint, or as it was started.
 
     Raises:
-      InvalidInput: the folder is not that of a run, or its checkpoint is damaged.
+      InvalidInput: the folder is not that of a run, or its checkpoints are damaged.
     """
     if checkpoint.latest(logdir) is None:
         started = rundir.read_config(pathlib.Path(logdir).expanduser())
         if started is not None:
             return started
-    return checkpoint.read_manifest(logdir)[1].config
+    return checkpoint.find(logdir, ()).manifest.config
 
 
 def check(logdir: str | os.PathLike[str], config: Config) -> None:
@@ -58,7 +59,11 @@ def check(logdir: str | os.PathLike[str], config: Config) -> None:
         if name not in MAY_DIFFER and value != saved[name]:
             remedy = f"{whose} with {saved[name]!r}; use that to resume"
             raise InvalidInput(name, value, remedy)
-    if path and config.env_steps <= (done := int(path.name)):
+    if path and config.env_steps <= int(path.name):
+        # It is as far as it should be; unless that checkpoint is damaged.
+        done = checkpoint.find(logdir).manifest.env_steps
+        if config.env_steps > done:
+            return
         remedy = f"the checkpoint is at {done} already; use more to continue it"
         raise InvalidInput("env_steps", config.env_steps, remedy)
 
@@ -75,31 +80,60 @@ def _refuse_to_lose(logdir: str | os.PathLike[str], started: Config) -> None:
         return
     remedy = (
         f"its checkpoints are gone or were never written, and starting over would lose the "
-        f"metrics of {lines[-1]['env_steps']} env steps; choose another --logdir"
+        f"metrics of {lines[-1]['env_steps']} env steps; choose another --logdir, or start "
+        "over with --fresh"
     )
     raise InvalidInput("logdir", str(logdir), remedy)
 
 
-def restore(logdir: str | os.PathLike[str], shapes: PyTree) -> tuple[PyTree, Manifest]:
-    """The saved `TrainState`; `shapes` is what the run would start with otherwise.
+class Restored(NamedTuple):
+    """What a run goes on from.
 
-    A run that is extended may want a larger replay than was saved: it is grown.
+    Attributes:
+      state: the `TrainState`.
+      episodes: what environments on the host did since their last reset; None without any.
+      manifest: of the checkpoint.
+      warning: a line about newer checkpoints, which are damaged and were set aside.
     """
-    _, manifest = checkpoint.read_manifest(logdir)
-    saved = manifest.leaves["state"].get(".replay.trajectory.reward")
+
+    state: PyTree
+    episodes: dict[str, np.ndarray] | None
+    manifest: Manifest
+    warning: str | None
+
+
+def restore(logdir: str | os.PathLike[str], shapes: PyTree) -> Restored:
+    """The newest whole checkpoint; `shapes` is what the run would start with otherwise.
+
+    A run that is extended may want a larger replay than was saved: it is grown. Newer
+    checkpoints that are damaged are renamed.
+
+    Raises:
+      InvalidInput: all are damaged, or not of this run; nothing was changed.
+      OSError: a damaged one cannot be renamed.
+    """
+    found = checkpoint.find(logdir)
+    state, episodes = _read(found, shapes), checkpoint.read_episodes(found)
+    for path, _ in found.damaged:
+        checkpoint.set_aside(path)
+    return Restored(state, episodes, found.manifest, checkpoint.warning(found))
+
+
+def _read(found: checkpoint.Found, shapes: PyTree) -> PyTree:
+    saved = found.manifest.leaves.get("state", {}).get(".replay.trajectory.reward")
     wanted = shapes.replay.trajectory.reward.shape[1]
     capacity = saved.shape[1] if saved else wanted
     target = shapes._replace(
         replay=_with_capacity(shapes.replay, capacity),
         images=_with_capacity(shapes.images, capacity),
     )
-    state, manifest = checkpoint.restore(logdir, target)
+    state = checkpoint.read_state(found, target)
     if wanted > capacity:
         state = state._replace(
             replay=grow(state.replay, wanted),
             images=grow_images(state.images, state.replay, wanted),
         )
-    return state, manifest
+    return state
 
 
 def _with_capacity(rings: PyTree, capacity: int) -> PyTree:

@@ -15,7 +15,7 @@ from vawm import manifest as manifest_lib
 from vawm.config import Config
 from vawm.errors import InvalidInput
 
-LOCK, CONFIG = "lock", "config.json"
+LOCK, CONFIG, REPLACED = "lock", "config.json", "replaced-"
 
 
 def check_new(logdir: pathlib.Path) -> None:
@@ -105,15 +105,37 @@ def read_config(logdir: pathlib.Path) -> Config | None:
     """
     try:
         content = json.loads((logdir / CONFIG).read_text())
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return None
     if not isinstance(content, dict) or not {"schema", "vawm", "config"} <= content.keys():
         return None
     return manifest_lib.config_from_dict(content["config"])
 
 
+def put_aside(logdir: pathlib.Path) -> pathlib.Path | None:
+    """Moves all that is in the folder into a new `replaced-<number>` in it; None if nothing.
+
+    What earlier calls have put aside stays where it is.
+
+    Raises:
+      OSError: something cannot be moved.
+    """
+    kept = (LOCK, f"{REPLACED}*")
+    found = [p for p in sorted(logdir.iterdir()) if not any(map(p.match, kept))]
+    if not found:
+        return None
+    number = 1
+    while (aside := logdir / f"{REPLACED}{number}").exists():
+        number += 1
+    aside.mkdir()
+    for path in found:
+        path.rename(aside / path.name)
+    return aside
+
+
 def clear(logdir: pathlib.Path) -> None:
     """Removes what a run measured that saved nothing; it is about to measure it again."""
-    for pattern in ("metrics.jsonl*", "events.out.tfevents.*", "videos.jsonl*", "videos/*"):
+    lines = ("metrics.jsonl*", "checkpoints.jsonl*", "videos.jsonl*")
+    for pattern in (*lines, "events.out.tfevents.*", "videos/*"):
         for path in logdir.glob(pattern):
             path.unlink()

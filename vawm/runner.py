@@ -34,9 +34,13 @@ from vawm import resume as resume_lib
 from vawm.config import Config
 from vawm.display import Display
 from vawm.envs.protocol import Environment, EnvironmentFailure, HostEnvironment
+from vawm.errors import InvalidInput
 from vawm.program import Program
 from vawm.tracking import Interval, Line
 from vawm.types import PyTree
+
+SAVE_LINES = "checkpoints.jsonl"
+"""A line about every checkpoint: its size, how long it took, how long training waited."""
 
 
 class RunError(RuntimeError):
@@ -80,6 +84,7 @@ def run(
     logdir: str | pathlib.Path,
     *,
     resume: bool = False,
+    fresh: bool = False,
     env: Environment | HostEnvironment | None = None,
     console: rich.console.Console | None = None,
     banner: str = "",
@@ -90,8 +95,9 @@ def run(
     Args:
       config: all choices of the run.
       logdir: a folder that is empty or not there yet; of the run to resume otherwise.
-      resume: continue from the newest checkpoint in `logdir`, or from the start where a
-        run was stopped before its first.
+      resume: continue from the newest whole checkpoint in `logdir`, or from the start where
+        a run was stopped before its first. Newer ones that are damaged are renamed.
+      fresh: start over in `logdir`; what is there goes into a folder `replaced-<number>`.
       env: an environment in place of the one that `config.task` names; one on the host is
         closed at the end.
       console: where progress goes; standard output by default.
@@ -111,7 +117,7 @@ def run(
         stack.enter_context(_explained(logdir))
         if not isinstance(env, Environment | None):
             stack.enter_context(contextlib.closing(env))
-        check(config, logdir, resume=resume, known_task=env is None)
+        check(config, logdir, resume=resume, fresh=fresh, known_task=env is None)
         program = stack.enter_context(contextlib.closing(prepare(config, env)))
         stack.enter_context(rundir.claim(logdir))
         if banner:
@@ -120,6 +126,8 @@ def run(
             state, progress = _continue(logdir, program, say)
             rundir.write_config(logdir, config)
         else:
+            if fresh and (aside := rundir.put_aside(logdir)):
+                say(f"what was in {logdir} is in {aside} now: this run starts over")
             if resume:
                 rundir.clear(logdir)
                 say(f"no checkpoint in {logdir} yet: this run starts from the beginning")
@@ -131,7 +139,12 @@ def run(
 
 
 def check(
-    config: Config, logdir: pathlib.Path, *, resume: bool, known_task: bool = True
+    config: Config,
+    logdir: pathlib.Path,
+    *,
+    resume: bool,
+    fresh: bool = False,
+    known_task: bool = True,
 ) -> None:
     """Refuses what cannot work; takes milliseconds and writes nothing.
 
@@ -142,8 +155,12 @@ def check(
     if known_task:
         suites.check_task(config)
     backends.check(config)
+    if resume and fresh:
+        raise InvalidInput("fresh", True, "starts over; leave out --resume, or this")
     if resume:
         resume_lib.check(logdir, config)
+        rundir.check_writable(logdir)
+    elif fresh:
         rundir.check_writable(logdir)
     else:
         rundir.check_new(logdir)
@@ -179,18 +196,33 @@ def prepare(
 def _continue(
     logdir: pathlib.Path, program: Program, say: Callable[[str], None]
 ) -> tuple[PyTree, Progress]:
-    state, manifest = resume_lib.restore(logdir, program.shapes)
-    state, lost = program.resume(state, checkpoint.restore_episodes(logdir))
+    restored = resume_lib.restore(logdir, program.shapes)
+    if restored.warning:
+        say(restored.warning)
+    state, lost = program.resume(restored.state, restored.episodes)
     if lost:
         say(
             f"warning: {lost} of {program.spec.num_envs} environments did not do the same "
             "again when their episodes were played once more; they begin new ones"
         )
-    saved = manifest.progress
-    progress = Progress(**saved | {"interval": Interval(**saved["interval"])})
+    progress = _progress(restored.manifest.progress)
     tracking.truncate(logdir / "metrics.jsonl", progress.logged)
     tracking.truncate(logdir / tracking.VIDEO_LINES, progress.env_steps)
+    tracking.truncate(logdir / SAVE_LINES, progress.env_steps)
     return state, progress
+
+
+def _progress(saved: dict[str, Any]) -> Progress:
+    """What `Saver` was given.
+
+    Raises:
+      InvalidInput: it was written with other counters.
+    """
+    try:
+        return Progress(**saved | {"interval": Interval(**saved["interval"])})
+    except (TypeError, KeyError) as error:
+        remedy = f"does not have the counters of a run ({error}); it is of another version"
+        raise InvalidInput("checkpoint", "progress", remedy) from error
 
 
 def _loop(
@@ -203,9 +235,8 @@ def _loop(
 ) -> Result:
     """Chunk after chunk; the only place where the device and the host meet."""
     display = Display(console, start=progress.env_steps, total=config.env_steps)
-    save = functools.partial(_save, logdir=logdir, config=config, program=program)
     film = video.make(program, config)
-    last_saved = progress.env_steps
+    log_save = functools.partial(_append, logdir / SAVE_LINES)
     resumed = bool(progress.env_steps)
     purge_after = progress.logged if resumed else None
     further = backends.connect(config, logdir, resumed=resumed, say=display.note)
@@ -215,6 +246,7 @@ def _loop(
             logdir, purge_after=purge_after, further=further, say=display.note
         ) as tracker,
         display,
+        checkpoint.Saver(logdir, config, program.spec, log=log_save) as saver,
     ):
         tracker.show_videos(after=progress.logged)
         display.note("compiling (takes a minute the first time, seconds from then on) ...")
@@ -224,7 +256,8 @@ def _loop(
             state, metrics = step(state)
             metrics = jax.device_get(metrics)
             progress = advance(progress, metrics, began=began)
-            _stop_if_nonfinite(metrics, progress, tracker, last_saved)
+            saver.check()
+            _stop_if_nonfinite(metrics, progress, tracker, saver)
             done = progress.env_steps >= config.env_steps
             if _crossed(before, progress.env_steps, config.log_every):
                 line = _line(progress)
@@ -235,17 +268,28 @@ def _loop(
                 tracker.write(_line(progress))
             if film and _crossed(before, progress.env_steps, config.video.every):
                 tracker.write_videos(film(state), env_steps=progress.env_steps)
-            if done or stop.signal or _crossed(before, progress.env_steps, config.save_every):
-                save(state, progress=progress)
-                last_saved = progress.env_steps
+            crossed = _crossed(before, progress.env_steps, config.save_every)
+            if done or stop.signal or crossed or saver.is_time():
+                saver.save(
+                    state,
+                    env_steps=progress.env_steps,
+                    progress=progress._asdict() | {"interval": progress.interval._asdict()},
+                    episodes=program.episodes(),
+                )
             display.advance(progress.env_steps, progress.interval)
     return Result(logdir, progress.env_steps, stop.exit_code)
 
 
 def advance(progress: Progress, metrics: Mapping[str, Any], *, began: float) -> Progress:
-    """`progress` after one more chunk, which started at `began`."""
+    """`progress` after one more chunk, which started at `began`.
+
+    Raises:
+      RunError: the chunk was no step forward.
+    """
     seconds = time.perf_counter() - began
     env_steps = int(metrics["env_steps"])
+    if env_steps <= progress.env_steps:
+        raise RunError(f"env_steps went from {progress.env_steps} back to {env_steps}")
     return Progress(
         env_steps=env_steps,
         updates=int(metrics["updates"]),
@@ -273,27 +317,16 @@ def _line(progress: Progress) -> Line:
     )
 
 
-def _save(
-    state: PyTree,
-    *,
-    progress: Progress,
-    logdir: pathlib.Path,
-    config: Config,
-    program: Program,
-) -> None:
-    checkpoint.save(
-        logdir,
-        state,
-        env_steps=progress.env_steps,
-        config=config,
-        spec=program.spec,
-        progress=progress._asdict() | {"interval": progress.interval._asdict()},
-        episodes=program.episodes(),
-    )
+def _append(path: pathlib.Path, line: Line) -> None:
+    with path.open("a") as file:
+        file.write(tracking.as_json(line) + "\n")
 
 
 def _stop_if_nonfinite(
-    metrics: Mapping[str, Any], progress: Progress, tracker: tracking.Tracker, last_saved: int
+    metrics: Mapping[str, Any],
+    progress: Progress,
+    tracker: tracking.Tracker,
+    saver: checkpoint.Saver,
 ) -> None:
     """A loss that is not finite never comes back: better no run than a wrong one."""
     if not int(metrics["chunk/updates"]):
@@ -301,9 +334,10 @@ def _stop_if_nonfinite(
     for name, value in metrics.items():
         if name.startswith("loss/") and not math.isfinite(value):
             tracker.write(_line(progress))
-            kept = f"the checkpoint at {last_saved}" if last_saved else "no checkpoint yet"
+            saver.wait()
             raise RunError(
-                f"{name} is {float(value)} at env_steps={progress.env_steps}; kept: {kept}. "
+                f"{name} is {float(value)} at env_steps={progress.env_steps}; "
+                f"kept: {_kept(saver.logdir)}. "
                 "Start again with a smaller --optimizer.learning-rate or another --seed"
             )
 
@@ -323,15 +357,18 @@ def _explained(logdir: pathlib.Path):
         remedy = "use a smaller replay.capacity, replay.batch_size or size"
         raise RunError(f"out of memory: {remedy} ({first})") from error
     except EnvironmentFailure as error:
-        newest = checkpoint.latest(logdir)
-        kept = f"the checkpoint at {int(newest.name)}" if newest else "no checkpoint yet"
         remedy = "to begin a new episode instead, start with --env.on-failure restart"
-        raise RunError(f"{error}; kept: {kept}; {remedy}") from error
+        raise RunError(f"{error}; kept: {_kept(logdir)}; {remedy}") from error
     except OSError as error:
         raise RunError(
             f"{error.filename or logdir}: {error.strerror or error}; "
             "put that right, then go on with --resume or start again"
         ) from error
+
+
+def _kept(logdir: pathlib.Path) -> str:
+    newest = checkpoint.latest(logdir)
+    return f"the checkpoint at {int(newest.name)}" if newest else "no checkpoint yet"
 
 
 def _summarise(

@@ -74,6 +74,7 @@ RULES: dict[str, Rule] = {
     "optimizer.beta1": BELOW_ONE,
     "optimizer.beta2": BELOW_ONE,
     "video.every": NOT_NEGATIVE,
+    "save_minutes": NOT_NEGATIVE,
 }
 """Every other number has to be positive."""
 

@@ -1,0 +1,45 @@
+"""Whether the files of a checkpoint are those that its manifest names."""
+
+from __future__ import annotations
+
+import pathlib
+import stat
+from collections.abc import Collection
+
+from vawm.manifest import Damaged, Manifest, item_of, sha256
+
+
+def verify(folder: pathlib.Path, manifest: Manifest, items: Collection[str]) -> None:
+    """Compares every file of `items` with its checksum; the cheap comparisons come first.
+
+    Raises:
+      Damaged: the first file that is missing, cut short, changed, or a link to elsewhere.
+    """
+    files = {name: file for name, file in manifest.files.items() if item_of(name) in items}
+    for name, (size, _) in files.items():
+        actual = _size(folder, name)
+        if actual != size:
+            raise Damaged(folder / name, f"has {actual} bytes instead of {size}")
+    for name, (_, digest) in files.items():
+        try:
+            matches = sha256(folder / name) == digest
+        except OSError as error:
+            raise Damaged(folder / name, f"cannot be read ({error.strerror})") from error
+        if not matches:
+            raise Damaged(folder / name, "does not match its checksum")
+
+
+def _size(folder: pathlib.Path, name: str) -> int:
+    """Bytes of a regular file that is in the folder itself, not behind a symbolic link."""
+    path = folder
+    for part in ("", *pathlib.PurePosixPath(name).parts):
+        path = path / part
+        try:
+            status = path.lstat()
+        except OSError as error:
+            raise Damaged(folder / name, "is missing") from error
+        if stat.S_ISLNK(status.st_mode):
+            raise Damaged(path, "is a symbolic link")
+    if not stat.S_ISREG(status.st_mode):
+        raise Damaged(path, "is not a file")
+    return status.st_size

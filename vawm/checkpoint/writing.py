@@ -1,0 +1,127 @@
+"""Writing a checkpoint: all or nothing."""
+
+from __future__ import annotations
+
+import os
+import pathlib
+import shutil
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from vawm import manifest as manifest_lib
+from vawm.checkpoint import arrays, folders, snapshot
+from vawm.checkpoint.snapshot import Snapshot
+from vawm.config import Config
+from vawm.manifest import Manifest
+from vawm.types import EnvSpec, PyTree
+
+
+class SaveError(RuntimeError):
+    """A checkpoint could not be written; the one before it is intact."""
+
+
+class Written(NamedTuple):
+    """A complete checkpoint, and the bytes that it takes of the disk."""
+
+    path: pathlib.Path
+    nbytes: int
+
+
+def save(
+    logdir: str | os.PathLike[str],
+    state: PyTree,
+    *,
+    env_steps: int,
+    config: Config,
+    spec: EnvSpec,
+    progress: Mapping[str, Any],
+    episodes: Mapping[str, np.ndarray] | None = None,
+) -> pathlib.Path:
+    """Writes a `TrainState` and returns when it is complete; `Saver` does not wait for that.
+
+    `episodes` are arrays of any shape beside it, see `restore_episodes`.
+
+    Raises:
+      SaveError: see `write`.
+    """
+    taken = snapshot.take(
+        state,
+        env_steps=env_steps,
+        config=config,
+        spec=spec,
+        progress=progress,
+        episodes=episodes,
+    )
+    return write(logdir, taken).path
+
+
+def write(logdir: str | os.PathLike[str], taken: Snapshot) -> Written:
+    """Writes a snapshot; deletes old checkpoints once the new one is complete.
+
+    Computes nothing with JAX, so any thread may call it; one at a time.
+
+    Raises:
+      SaveError: nothing was changed, because the disk is full, a parameter is not finite, or
+        there is a checkpoint at these env steps or later ones.
+    """
+    final = folders.folder(logdir, taken.env_steps)
+    refuse_backwards(logdir, taken.env_steps)
+    _refuse_nonfinite(taken.arrays.get("params", {}) | taken.arrays.get("model_state", {}))
+    scratch = final.with_name(folders.SCRATCH + final.name)
+    try:
+        shutil.rmtree(scratch, ignore_errors=True)
+        scratch.mkdir(parents=True)
+        for item in taken.leaves:
+            arrays.write(scratch / item, taken.arrays[item])
+        nbytes = manifest_lib.write(scratch, _manifest(taken))
+        scratch.rename(final)
+        folders.sync(final.parent)
+    except Exception as error:
+        shutil.rmtree(scratch, ignore_errors=True)
+        raise SaveError(_why_not_saved(final, taken.nbytes, error)) from error
+    folders.prune(logdir, taken.config.keep_checkpoints)
+    return Written(final, nbytes)
+
+
+def refuse_backwards(logdir: str | os.PathLike[str], env_steps: int) -> None:
+    """Refuses to save at or before the newest checkpoint.
+
+    Raises:
+      SaveError: there is one that is as new; nothing was changed.
+    """
+    newest = folders.latest(logdir)
+    if newest is not None and env_steps <= int(newest.name):
+        raise SaveError(
+            f"checkpoint {folders.folder(logdir, env_steps)} is not written: the newest one "
+            f"is at {int(newest.name)} env steps, and a run does not go backwards"
+        )
+
+
+def _manifest(taken: Snapshot) -> Manifest:
+    return Manifest(
+        version=manifest_lib.version(),
+        env_steps=taken.env_steps,
+        config=taken.config,
+        spec=taken.spec,
+        progress=taken.progress,
+        leaves=taken.leaves,
+        files={},
+    )
+
+
+def _refuse_nonfinite(needed: Mapping[str, np.ndarray]) -> None:
+    """What acting needs has to be finite."""
+    for path, array in needed.items():
+        if not np.isfinite(array).all():
+            raise SaveError(f"parameter {path} is not finite; no checkpoint is written")
+
+
+def _why_not_saved(final: pathlib.Path, needed: int, error: Exception) -> str:
+    free = shutil.disk_usage(final.parents[1]).free
+    reason = (str(error).strip() or repr(error)).splitlines()[0]
+    return (
+        f"checkpoint {final} could not be written (up to {needed / 2**20:.0f} MiB needed, "
+        f"{free / 2**20:.0f} MiB free): {reason[:200]}"
+    )
