@@ -108,6 +108,7 @@ def spec_as_dict(spec: EnvSpec) -> dict[str, Any]:
 
 def spec_from_dict(content: dict[str, Any]) -> EnvSpec:
     """The inverse of `spec_as_dict`; ValueError or TypeError where it is none."""
+    kinds: dict[str, type | tuple[type, ...]]
     kinds = {"task": str, "obs": dict, "action_size": int, "discrete": bool}
     kinds |= {"num_envs": int, "action_repeat": int, "episode_length": (int, type(None))}
     spec = _record(content, kinds)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import math
+import os
 import pathlib
 import time
 from collections.abc import Callable, Mapping
@@ -366,7 +367,7 @@ def _explained(logdir: pathlib.Path):
         ) from error
 
 
-def _kept(logdir: pathlib.Path) -> str:
+def _kept(logdir: str | os.PathLike[str]) -> str:
     newest = checkpoint.latest(logdir)
     return f"the checkpoint at {int(newest.name)}" if newest else "no checkpoint yet"
 

@@ -60,8 +60,8 @@ def find(logdir: str | os.PathLike[str], items: Collection[str] | None = None) -
         else:
             return Found(path, manifest, tuple(damaged))
     if damaged:
-        error = damaged[0][1]
-        raise Damaged(error.path, f"{error.how}; and no older checkpoint is whole")
+        first = damaged[0][1]
+        raise Damaged(first.path, f"{first.how}; and no older checkpoint is whole")
     raise InvalidInput(
         "logdir",
         str(logdir),

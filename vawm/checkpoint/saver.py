@@ -79,8 +79,8 @@ class Saver:
         Raises:
           SaveError: the save before failed, or there is a checkpoint as new as this.
         """
-        began = time.monotonic()
         self.wait()
+        began = time.monotonic()
         writing.refuse_backwards(self.logdir, env_steps)
         taken = snapshot.take(
             state,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import pathlib
 import shutil
@@ -81,6 +82,8 @@ def write(logdir: str | os.PathLike[str], taken: Snapshot) -> Written:
     except Exception as error:
         shutil.rmtree(scratch, ignore_errors=True)
         raise SaveError(_why_not_saved(final, taken.nbytes, error)) from error
+    finally:
+        gc.collect()  # Orbax leaves cycles behind that hold all of it, compressed
     folders.prune(logdir, taken.config.keep_checkpoints)
     return Written(final, nbytes)
 
