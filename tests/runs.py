@@ -5,6 +5,7 @@ import io
 import struct
 
 import rich.console
+import tiny
 import toy
 from tensorboardX.proto.event_pb2 import Event
 
@@ -15,6 +16,17 @@ WALL_TIME = ("time", "env_steps_per_s", "updates_per_s")
 
 def quiet():
     return rich.console.Console(file=io.StringIO())
+
+
+def save_toy(logdir, state, env_steps=8, **changes):
+    """A checkpoint of `toy.state()` as one of `tiny.CONFIG`."""
+    usual = {"config": tiny.CONFIG, "spec": toy.SPEC, "progress": {}}
+    return checkpoint.save(logdir, state, env_steps=env_steps, **usual | changes)
+
+
+def files_of(path):
+    """Every file of a checkpoint in which there is something."""
+    return sorted(file for file in path.rglob("*") if file.is_file() and file.stat().st_size)
 
 
 def lines(logdir):

@@ -8,6 +8,8 @@ these; losses only ever receive numbers.
 from __future__ import annotations
 
 import dataclasses
+import functools
+import typing
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
 
@@ -496,6 +498,12 @@ def with_size(config: Config, size: str) -> Config:
         actor=dataclasses.replace(config.actor, units=widths["units"]),
         critic=dataclasses.replace(config.critic, units=widths["units"]),
     )
+
+
+@functools.cache
+def kinds(cls: type) -> dict[str, Any]:
+    """Field -> its type, of a dataclass of choices; not to be changed."""
+    return typing.get_type_hints(cls)
 
 
 def as_dict(config: Config) -> dict[str, Any]:

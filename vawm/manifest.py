@@ -11,7 +11,6 @@ import os
 import pathlib
 import re
 import stat
-import typing
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -138,7 +137,7 @@ def config_from_dict(content: dict[str, Any], cls: type = Config) -> Any:
         raise InvalidInput(
             f"{cls.__name__}.{name[:40]}", content.get(name), f"{verb} (other version)"
         )
-    hints = typing.get_type_hints(cls)
+    hints = dict(config_lib.kinds(cls))
     if cls is Config:
         for name, known in (
             ("suite", config_lib.ENV_CONFIGS),
@@ -174,6 +173,8 @@ def write(folder: pathlib.Path, manifest: Manifest) -> int:
     Returns:
       the bytes of all these files.
     """
+    found = [path for path in sorted(folder.rglob("*")) if path.is_file()]
+    sizes = {path: path.stat().st_size for path in found}
     content = manifest._asdict() | {
         "schema": SCHEMA,
         "config": config_lib.as_dict(manifest.config),
@@ -183,24 +184,29 @@ def write(folder: pathlib.Path, manifest: Manifest) -> int:
             for item, leaves in manifest.leaves.items()
         },
         "files": {
-            str(path.relative_to(folder)): [path.stat().st_size, sha256(path)]
-            for path in sorted(folder.rglob("*"))
-            if path.is_file()
+            path.relative_to(folder).as_posix(): [size, sha256(path)]
+            for path, size in sizes.items()
         },
     }
     text = json.dumps(content, indent=1).encode()
+    digest = hashlib.sha256(text).hexdigest().encode() + b"\n"
     (folder / NAME).write_bytes(text)
-    (folder / DIGEST).write_text(hashlib.sha256(text).hexdigest() + "\n")
-    for name in (NAME, DIGEST):
-        sha256(folder / name)
-    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+    (folder / DIGEST).write_bytes(digest)
+    for path in (*found, folder / NAME, folder / DIGEST):
+        _sync(path)
+    return sum(sizes.values()) + len(text) + len(digest)
 
 
 def sha256(path: pathlib.Path) -> str:
-    """Checksum of a file, which is on the disk, not in a buffer, when this returns."""
+    """Checksum of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _sync(path: pathlib.Path) -> None:
+    """Returns when a file is on the disk, not in a buffer."""
     with path.open("rb") as file:
         os.fsync(file.fileno())
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def read(folder: pathlib.Path) -> Manifest:

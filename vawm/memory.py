@@ -45,7 +45,7 @@ WORKING_FACTOR = 4
 what `working_bytes` counts; rounded up."""
 SAVING_COPIES = 4
 """While a checkpoint is written: what it holds, the copy that is written, that compressed, and
-what the allocator keeps of the save before. Measured 3.0 for one save of random floats, 3.6 to
+what the allocator keeps of the save before. Measured 3.0 for one save of random floats, 3.4 to
 3.9 for four in a row, and 2.7 for bytes of 2 bits each."""
 IMAGE_FACTOR = 2
 """Measured per number in the maps of images, for a batch of 16 x 64: 1.1 at size 1m, 1.7 at

@@ -238,6 +238,7 @@ def _loop(
     display = Display(console, start=progress.env_steps, total=config.env_steps)
     film = video.make(program, config)
     log_save = functools.partial(_append, logdir / SAVE_LINES)
+    last_saved = progress.env_steps
     resumed = bool(progress.env_steps)
     purge_after = progress.logged if resumed else None
     further = backends.connect(config, logdir, resumed=resumed, say=display.note)
@@ -269,14 +270,16 @@ def _loop(
                 tracker.write(_line(progress))
             if film and _crossed(before, progress.env_steps, config.video.every):
                 tracker.write_videos(film(state), env_steps=progress.env_steps)
-            crossed = _crossed(before, progress.env_steps, config.save_every)
-            if done or stop.signal or crossed or saver.is_time():
+            due = done or stop.signal or saver.is_time()
+            due = due or _crossed(before, progress.env_steps, config.save_every)
+            if due and progress.env_steps > last_saved:
                 saver.save(
                     state,
                     env_steps=progress.env_steps,
                     progress=progress._asdict() | {"interval": progress.interval._asdict()},
                     episodes=program.episodes(),
                 )
+                last_saved = progress.env_steps
             display.advance(progress.env_steps, progress.interval)
     return Result(logdir, progress.env_steps, stop.exit_code)
 
@@ -285,11 +288,11 @@ def advance(progress: Progress, metrics: Mapping[str, Any], *, began: float) -> 
     """`progress` after one more chunk, which started at `began`.
 
     Raises:
-      RunError: the chunk was no step forward.
+      RunError: the chunk was a step backwards.
     """
     seconds = time.perf_counter() - began
     env_steps = int(metrics["env_steps"])
-    if env_steps <= progress.env_steps:
+    if env_steps < progress.env_steps:  # as many where all environments were reset
         raise RunError(f"env_steps went from {progress.env_steps} back to {env_steps}")
     return Progress(
         env_steps=env_steps,

@@ -83,7 +83,7 @@ def write(logdir: str | os.PathLike[str], taken: Snapshot) -> Written:
         shutil.rmtree(scratch, ignore_errors=True)
         raise SaveError(_why_not_saved(final, taken.nbytes, error)) from error
     finally:
-        gc.collect()  # Orbax leaves cycles behind that hold all of it, compressed
+        gc.collect(1)  # Orbax leaves young cycles that hold all of it, compressed
     folders.prune(logdir, taken.config.keep_checkpoints)
     return Written(final, nbytes)
 
