@@ -271,3 +271,8 @@ def test_what_goes_wrong_is_one_line(capsys, error, code):
 
     assert command_line.guard(fail) == code
     assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_starting_over_is_a_flag_and_not_the_usual():
+    assert parse("--logdir", "run", "--fresh").fresh
+    assert not parse("--logdir", "run").fresh

@@ -56,6 +56,7 @@ def saved(tmp_path):
 
 def test_a_run_may_be_extended_and_logged_otherwise(saved):
     resume.check(saved, tiny.config(env_steps=10_000, log_every=3, save_every=5))
+    resume.check(saved, tiny.config(env_steps=96, save_minutes=0.0, keep_checkpoints=5))
 
 
 @pytest.mark.parametrize(

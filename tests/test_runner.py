@@ -7,6 +7,7 @@ import math
 import os
 import shutil
 import signal
+import time
 
 import jax
 import jax.numpy as jnp
@@ -14,10 +15,10 @@ import pytest
 import rich.console
 import tiny
 import toy
-from runs import assert_same, events, lines, measured, quiet
+from runs import assert_same, events, files_of, lines, measured, quiet
 from tensorboardX.proto.event_pb2 import SessionLog
 
-from vawm import backends, checkpoint, envs, memory, runner
+from vawm import backends, checkpoint, envs, manifest, memory, runner, tracking
 from vawm.errors import InvalidInput
 from vawm.program import Program
 from vawm.runner import RunError
@@ -118,6 +119,87 @@ def test_a_tracker_that_fails_changes_nothing_but_one_line_of_output(
     assert console.file.getvalue().count("warning: wandb gets no more") == 1
     assert measured(tmp_path / "with") == measured(tmp_path / "without")
     assert checkpoint.latest(tmp_path / "with").name == "000000000096"
+
+
+def saves(logdir):
+    return [line["env_steps"] for line in tracking.read(logdir / runner.SAVE_LINES)]
+
+
+def test_a_line_tells_of_each_checkpoint(tmp_path, fake):
+    fake()
+    run(tiny.CONFIG, tmp_path)
+    names = {"checkpoint/bytes", "checkpoint/seconds", "checkpoint/blocked_seconds"}
+    assert saves(tmp_path) == [32, 64, 96]
+    for line in tracking.read(tmp_path / runner.SAVE_LINES):
+        assert line.keys() == names | {"env_steps"}
+    assert not any("checkpoint/bytes" in line for line in lines(tmp_path))
+
+
+def test_checkpoints_by_time_change_nothing_that_is_measured(tmp_path, fake):
+    fake()
+    for name, minutes in (("often", 1e-9), ("never", 0.0)):
+        config = tiny.config(save_minutes=minutes, save_every=1000, env_steps=48)
+        run(config, tmp_path / name)
+    assert saves(tmp_path / "often") == [8, 16, 24, 32, 40, 48]
+    assert saves(tmp_path / "never") == [48]
+    assert measured(tmp_path / "often") == measured(tmp_path / "never")
+    kept = [int(path.name) for path in checkpoint.complete(tmp_path / "often")]
+    assert kept == [48, 40]
+
+
+def test_a_chunk_without_a_step_forward_is_not_saved_again(tmp_path, fake, monkeypatch):
+    """As where every environment is reset; one that goes back is an error."""
+    steps = iter([8, 8, 16, 8])
+    fake()
+    advance = runner.advance
+    monkeypatch.setattr(
+        runner,
+        "advance",
+        lambda progress, metrics, began: advance(
+            progress, metrics | {"env_steps": next(steps)}, began=began
+        ),
+    )
+    with pytest.raises(RunError, match="env_steps went from 16 back to 8"):
+        run(tiny.config(save_minutes=1e-9), tmp_path)
+    assert saves(tmp_path) == [8, 16]
+
+
+def test_a_disk_that_is_full_when_saving_ends_the_run_and_keeps_the_checkpoint(
+    tmp_path, fake, monkeypatch
+):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    def loss(env_steps):
+        if env_steps == 64:
+            while checkpoint.latest(tmp_path) is None:  # that at 32
+                time.sleep(0.01)
+            monkeypatch.setattr(manifest, "write", full)
+        return 1.0
+
+    fake(loss)
+    with pytest.raises(checkpoint.SaveError, match=r"000000000064 could not .*No space left"):
+        run(tiny.CONFIG, tmp_path)
+    monkeypatch.undo()
+    assert [path.name for path in checkpoint.root(tmp_path).iterdir()] == ["000000000032"]
+    assert checkpoint.find(tmp_path).manifest.env_steps == 32
+
+
+def test_starting_over_on_purpose_moves_what_is_there_aside(tmp_path, fake):
+    fake()
+    run(tiny.CONFIG, tmp_path / "run", fresh=True)
+    for number in (1, 2):
+        before = measured(tmp_path / "run")
+        console = quiet()
+        config = tiny.config(seed=number, env_steps=48 + 8 * number)
+        run(config, tmp_path / "run", fresh=True, console=console)
+        aside = tmp_path / "run" / f"replaced-{number}"
+        assert f"is in {aside} now: this run starts over" in console.file.getvalue()
+        assert measured(aside) == before
+        assert checkpoint.find(aside).manifest.config.seed == number - 1
+        assert checkpoint.find(tmp_path / "run").manifest.config.seed == number
+    with pytest.raises(InvalidInput, match="fresh=True: starts over; leave out --resume"):
+        run(tiny.CONFIG, tmp_path / "run", fresh=True, resume=True)
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
@@ -275,6 +357,22 @@ def test_k_steps_and_the_rest_equal_a_run_in_one_piece(tmp_path, uninterrupted, 
     run(LONG, tmp_path, resume=True)
     assert_same(tmp_path, uninterrupted, LONG, tiny.env())
     assert starts(tmp_path) == [97]
+
+
+def test_a_run_whose_newest_checkpoint_is_damaged_goes_on_from_the_one_before(
+    tmp_path, uninterrupted
+):
+    logdir = shutil.copytree(uninterrupted, tmp_path / "run")
+    damaged = files_of(checkpoint.latest(logdir) / "state")[-1]
+    damaged.write_bytes(damaged.read_bytes()[:-1])
+    console = quiet()
+    run(LONG, logdir, resume=True, console=console)
+    [line] = [line for line in console.file.getvalue().splitlines() if "WARNING" in line]
+    assert str(damaged) in line
+    assert line.endswith("using the one at 160 env steps instead")
+    assert (checkpoint.root(logdir) / "damaged-000000000192").is_dir()
+    assert saves(logdir) == saves(uninterrupted)
+    assert_same(logdir, uninterrupted, LONG, tiny.env())
 
 
 def starts(logdir):

@@ -112,7 +112,8 @@ def values(config: Config) -> Iterator[tuple[str, Any]]:
 
 def fields(node: Any, prefix: str = "") -> Iterator[tuple[str, Any, Any]]:
     """(dotted name, value, type) of every field that holds no further fields."""
-    hints = config_lib.kinds(type(node))
+    kind: type = type(node)
+    hints = config_lib.kinds(kind)
     for field in dataclasses.fields(node):
         name, value = prefix + field.name, getattr(node, field.name)
         if dataclasses.is_dataclass(value):
