@@ -68,9 +68,10 @@ def test_what_is_restored_instead_is_the_older_state_with_one_warning(logdir, ca
     state, saved = checkpoint.restore(logdir, toy.state())
     toy.assert_equal(state, toy.state(8))
     assert saved.env_steps == 8
-    [line] = [record.getMessage() for record in caplog.records if record.name == "vawm"]
-    assert line == (
-        f"WARNING: damaged checkpoint: {damaged} does not match its checksum; "
+    [record] = [record for record in caplog.records if record.name == "vawm"]
+    assert record.levelname == "WARNING"
+    assert record.getMessage() == (
+        f"damaged checkpoint: {damaged} does not match its checksum; "
         "using the one at 8 env steps instead"
     )
 

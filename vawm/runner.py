@@ -199,7 +199,7 @@ def _continue(
 ) -> tuple[PyTree, Progress]:
     restored = resume_lib.restore(logdir, program.shapes)
     if restored.warning:
-        say(restored.warning)
+        say(f"WARNING: {restored.warning}")
     state, lost = program.resume(restored.state, restored.episodes)
     if lost:
         say(

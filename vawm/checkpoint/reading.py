@@ -76,7 +76,7 @@ def warning(found: Found) -> str | None:
     _, error = found.damaged[0]
     more = f" (and {len(found.damaged) - 1} more)" if len(found.damaged) > 1 else ""
     return (
-        f"WARNING: damaged checkpoint{more}: {error.path} {error.how}; "
+        f"damaged checkpoint{more}: {error.path} {error.how}; "
         f"using the one at {found.manifest.env_steps} env steps instead"
     )
 
