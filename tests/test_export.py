@@ -274,7 +274,7 @@ def flip(data):
         ("config.json", lambda data: data.replace(b'"schema": 1', b'"schema": 2'), "layout"),
         ("config.json", lambda data: data.replace(b'"seed": 0', b'"seed": -1'), "seed=-1"),
         ("config.json", lambda data: data.replace(b'"seed"', b'"sede"'), "other version"),
-        ("config.json", lambda data: data.replace(b'"obs"', b'"abs"'), "KeyError"),
+        ("config.json", lambda data: data.replace(b'"obs"', b'"abs"'), "obs is missing"),
     ],
 )
 def test_a_damaged_file_is_one_line(copy, name, change, message):
