@@ -6,7 +6,7 @@
 
 `from_gymnasium` runs any Gymnasium environment, in processes of its own. Importing this
 module is cheap: MuJoCo is loaded by `make`, and what runs processes when it is asked for.
-It registers the tasks with Gymnasium, as "vawm/<task>-v0", and "vawm/GridWorld-v0".
+It registers the tasks with Gymnasium, as `vawm/<task>-v0`, and "vawm/GridWorld-v0".
 """
 
 from __future__ import annotations
