@@ -56,23 +56,11 @@ def panels(
 ) -> Iterator[np.ndarray]:
     """`[rows, columns]` axes of `size` inches each, saved to `path` at the end."""
     check()
-    import matplotlib
+    from matplotlib.figure import Figure  # without pyplot, which has a backend of its caller's
 
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(
-        rows,
-        columns,
-        figsize=(size[0] * columns, size[1] * rows),
-        squeeze=False,
-        layout="constrained",
-    )
-    try:
-        yield axes
-        figure.savefig(path, dpi=DPI)
-    finally:
-        plt.close(figure)
+    figure = Figure(figsize=(size[0] * columns, size[1] * rows), layout="constrained")
+    yield figure.subplots(rows, columns, squeeze=False)
+    figure.savefig(path, dpi=DPI)
 
 
 def value_errors(reports: Mapping[str, Report], path: pathlib.Path) -> None:

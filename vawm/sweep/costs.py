@@ -137,12 +137,10 @@ def write_csv(rows: Rows, path: pathlib.Path) -> None:
 
 def plot(rows: Rows, sweep: Sweep, path: pathlib.Path) -> None:
     """Seconds of a sample, with quartiles, and peak memory: a group of bars per task."""
-    import matplotlib
+    from matplotlib.figure import Figure  # without pyplot, which has a backend of its caller's
 
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, (time, memory) = plt.subplots(1, 2, figsize=(9, 3.2))
+    figure = Figure(figsize=(9, 3.2))
+    time, memory = figure.subplots(1, 2)
     width, places = 0.8 / len(sweep.variants), range(len(sweep.tasks))
     for number, variant in enumerate(sweep.variants):
         own = [row for row in rows if row["variant"] == variant.name]
@@ -159,4 +157,3 @@ def plot(rows: Rows, sweep: Sweep, path: pathlib.Path) -> None:
     time.legend(title="value alignment")
     figure.tight_layout()
     figure.savefig(path, dpi=110)
-    plt.close(figure)

@@ -34,14 +34,12 @@ def plot(
         the steps that all of them have.
       returns: lower and upper end of the axis of returns; as the data need it if None.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    from matplotlib.figure import Figure  # without pyplot, which has a backend of its caller's
 
     width, height = len(sweep.tasks), len(quantities)
     size = (4.5 * width, 3.2 * height)
-    figure, panels = plt.subplots(height, width, figsize=size, squeeze=False)
+    figure = Figure(figsize=size)
+    panels = figure.subplots(height, width, squeeze=False)
     draw = {"lines": _lines, "band": _band}[seeds]
     for quantity, line in zip(quantities, panels, strict=True):
         for task, panel in zip(sweep.tasks, line, strict=True):
@@ -58,7 +56,6 @@ def plot(
     panels[0][0].legend()
     figure.tight_layout()
     figure.savefig(path, dpi=110)
-    plt.close(figure)
 
 
 def _lines(panel, curves: Sequence[Rows], quantity: str, color: str, label: str) -> None:
