@@ -22,11 +22,13 @@ ORDER = {
     "Data and choices": ("types", "config", "presets", "errors"),
     "World models": ("world_model", "imagination", "nets"),
     "Actor and critic": ("actor_critic", "agent"),
-    "Learning": ("objective", "learner", "learn", "optim", "replay", "image_store"),
+    "Losses of an agent": ("objective", "value_gradient"),
+    "Learning": ("learner", "learn", "optim", "replay", "image_store"),
     "Training": ("train", "host_train", "collector", "suites"),
     "Environments": ("envs",),
     "Runs": ("runner", "checkpoint", "resume", "rundir", "tracking", "validate"),
-    "Evaluation": ("policy", "evaluate", "play", "scores", "analysis"),
+    "Evaluation": ("policy", "evaluate", "play", "scores", "export"),
+    "Comparison": ("analysis", "sweep", "overhead"),
 }
 """Title -> rooms of the package, which are modules or folders, in the order of reading."""
 

@@ -9,7 +9,7 @@
     curves         losses and the weight of value alignment in training, Figs 8, 9 and 12
 
 Plays whole episodes of every run in its own environments; all but `curves` is read from these.
-Works for either agent, from vectors and from pixels. Needs the extra `analysis`.
+Works for every agent, from vectors and from pixels. Needs the extra `analysis`.
 """
 
 from __future__ import annotations

@@ -39,6 +39,8 @@ def possible(name, scale, agent):
     config = presets.PRESETS[agent].get(chosen.suite, {}).get(chosen.preset)
     if config is None:
         return False
+    if name == "noise" and agent == "vagram":
+        return False
     return name != "replay_gradient" or config.critic.replay_scale > 0
 
 

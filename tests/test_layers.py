@@ -17,7 +17,7 @@ LAYERS = {
     "types": set(),
     "transforms": set(),
     "signals": set(),
-    "losses": {"transforms"},
+    "losses": {"returns", "transforms"},
     "returns": set(),
     "distributions": {"transforms"},
     "optim": {"config"},

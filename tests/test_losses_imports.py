@@ -15,4 +15,4 @@ def test_the_losses_import_no_networks_no_environments_and_no_other_room():
     assert "vawm.losses.vagram" in modules
     assert not HEAVY & {name.split(".")[0] for name in modules}
     rooms = {name.split(".")[1] for name in modules if name.startswith("vawm.")}
-    assert rooms == {"losses", "transforms"}
+    assert rooms == {"losses", "returns", "transforms"}

@@ -54,6 +54,7 @@ def test_symlog_has_slope_one_at_zero_and_keeps_sign():
     twin = np.sign(x) * np.log1p(np.abs(np.float64(x)))
     np.testing.assert_allclose(transforms.symlog(x), twin, rtol=1e-6)
     assert jax.grad(transforms.symlog)(1e-9) == pytest.approx(1.0)
+    assert jax.grad(transforms.symlog)(0.0) == 0.0
 
 
 def test_symexp_inverts_symlog():

@@ -60,8 +60,9 @@ def slow_loss(critic, unit, scale):
             for x in (inferred.post_logits, inferred.prior_logits)
         )
         along, h = z.reshape(16) @ WEIGHT, inferred.latent.deter[at].mean()
+        centred = WEIGHT.reshape(4, 4) - WEIGHT.reshape(4, 4).mean(-1, keepdims=True)
         for j, (a, b) in enumerate(zip(guess.reshape(16), z.reshape(16), strict=True)):
-            gradient = critic * 2 * along * WEIGHT[j] * h
+            gradient = critic * 2 * along * centred.reshape(16)[j] * h
             if unit == "symlog":
                 gradient /= 1 + abs(critic * along**2 * h)
             loss[at] += scale * (gradient * (a - b)) ** 2
@@ -106,6 +107,19 @@ def test_the_other_forms_are_those_of_the_library(form, function):
     np.testing.assert_allclose(actual, expected, rtol=1e-4)
 
 
+def test_a_critic_that_ignores_z_has_no_loss():
+    """Weights that are equal over the classes of a categorical say nothing of its class."""
+    ignoring = AGENT._replace(
+        critic=SIMPLE.critic._replace(
+            logits=lambda p, latent: (
+                p * latent.stoch.sum(-1) @ jnp.arange(1.0, 5.0) * latent.deter.mean(-1)
+            )[..., None]
+        )
+    )
+    loss = make_value_gradient_loss(ignoring, model())
+    np.testing.assert_allclose(loss(jnp.float32(2), jnp.float32(3), inference()), 0, atol=1e-9)
+
+
 @functools.cache
 def gradient(**changes):
     """Of the world model's loss."""
@@ -135,6 +149,13 @@ def test_vagram_alone_trains_the_prior_and_reaches_h():
     assert norm(moved["rssm"]["gru"]) > 0
     for head in ("decoder", "reward", "cont"):
         assert norm(moved[head]) == 0.0
+
+
+@pytest.mark.parametrize("form", ["taylor", "second_order"])
+def test_the_other_forms_train_the_prior_with_the_critic_itself(form):
+    own, metrics = gradient(value_gradient_form=form)
+    assert 0 < norm(own["rssm"]["prior_net"]) < np.inf
+    assert metrics["loss/value_gradient"] > 0
 
 
 def test_the_decoder_only_shows_what_rewards_and_values_have_made_of_the_latents():

@@ -18,7 +18,10 @@ Array = jax.Array
 
 
 def symlog(x: Array) -> Array:
-    """sign(x) * log(1 + |x|): compresses magnitude, keeps sign and the slope at 0."""
+    """sign(x) * log(1 + |x|): compresses magnitude, keeps sign and the slope around 0.
+
+    At exactly 0 JAX gives the gradient 0 instead of 1, as of the absolute value.
+    """
     return jnp.sign(x) * jnp.log1p(jnp.abs(x))
 
 

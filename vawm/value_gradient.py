@@ -25,7 +25,9 @@ def make_value_gradient_loss(
 
         L = scale * sum_j (dV/dz_j)^2 (z~_j - sg z_j)^2,    dV/dz at (h_t, z_t)
 
-    or another of its forms. z~ are the probabilities of the prior, z of the posterior, after
+    or another of its forms. Each categorical of z sums to 1, which leaves dV/dz open up to a
+    number for all classes of one; it is centred there, so that a critic that ignores z has no
+    loss. z~ are the probabilities of the prior, z of the posterior, after
     unimix; V is the critic's mean, or its symlog. Gradients reach the world model through z~:
     the prior, and h_t by way of it. The critics' parameters are stopped, and so is everything
     that the value is differentiated at.
@@ -34,7 +36,10 @@ def make_value_gradient_loss(
 
     def value_of(critic: PyTree, deter: Array) -> Callable[[Array], Array]:
         def value(z: Array) -> Array:
-            stoch = z.reshape(*z.shape[:-1], model.stoch, model.classes).astype(deter.dtype)
+            stoch = z.reshape(*z.shape[:-1], model.stoch, model.classes)
+            # The same z, for what sums to 1; its gradient is centred in each categorical.
+            stoch = stoch - stoch.mean(-1, keepdims=True) + 1 / model.classes
+            stoch = stoch.astype(deter.dtype)
             mean = agent.critic.code.mean(agent.critic.logits(critic, Latent(deter, stoch)))
             return transforms.symlog(mean) if model.value_gradient_unit == "symlog" else mean
 

@@ -5,9 +5,11 @@
     python experiments/ablations/capacity.py --scale paper          # Fig. 2a
     python experiments/ablations/capacity.py --vary image --scale paper
 
-Models are the three smallest of the agent: 1m, 12m and 25m of DreamerV3. Images are 64, 96 and
-128 pixels a side, at size 12m in the paper. The quick scale is so short, for the sake of the
-large ones, that it shows no more than that everything works: nothing is learnt in it.
+Models are up to three of the smallest of the agent: 1m, 12m and 25m of DreamerV3, 1m and 16m of
+STORM. Images are 64, 96 and 128 pixels a side, in the paper at its preset's size. VaGraM is
+what value alignment is compared with, so `--agent vagram` has no L_var. The quick scale is so short,
+for the sake of the large ones, that it shows no more than that everything works: nothing is
+learnt in it.
 """
 
 from __future__ import annotations
@@ -38,17 +40,18 @@ class Options(ablation.Options):
     """model: size of the agent, Fig. 2a; image: pixels a side, Fig. 2b"""
 
 
-def crossed(flag: str, sizes: Sequence[str]) -> tuple[Variant, ...]:
+def crossed(agent: str, flag: str, sizes: Sequence[str]) -> tuple[Variant, ...]:
+    alignments = {"off": ablation.OFF} if agent == "vagram" else ALIGNMENTS
     return tuple(
         Variant(f"{size} {name}", (flag, size, *words))
-        for size, (name, words) in itertools.product(sizes, ALIGNMENTS.items())
+        for size, (name, words) in itertools.product(sizes, alignments.items())
     )
 
 
 MODEL = ablation.Ablation(
     name="capacity_model",
     title="Model size and value alignment (Fig. 2a).",
-    variants=lambda agent: crossed("--size", list(config_lib.SIZES[agent])[:3]),
+    variants=lambda agent: crossed(agent, "--size", list(config_lib.SIZES[agent])[:3]),
     quick=ablation.QUICK._replace(
         tasks=("cartpole_balance",), seeds=(0,), env_steps=8_000, flags=FEW_UPDATES
     ),
@@ -58,7 +61,7 @@ MODEL = ablation.Ablation(
 IMAGE = ablation.Ablation(
     name="capacity_image",
     title="Image size and value alignment (Fig. 2b).",
-    variants=lambda agent: crossed("--env.image-size", ("64", "96", "128")),
+    variants=lambda agent: crossed(agent, "--env.image-size", ("64", "96", "128")),
     quick=ablation.Scale(
         "dmc_vision", "quick", ("cartpole_balance",), (0,), 6_000, FEWER_UPDATES
     ),

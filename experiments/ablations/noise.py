@@ -14,17 +14,25 @@ import sys
 from collections.abc import Sequence
 
 from vawm import command_line
+from vawm.errors import InvalidInput
 from vawm.sweep import ablation
 from vawm.sweep.runs import Variant
 
-VARIANTS = tuple(
-    Variant(noise, (*ablation.ADAPTIVE, "--value-alignment.noise", noise))
-    for noise in ("independent", "shared")
-)
+
+def variants(agent: str) -> tuple[Variant, ...]:
+    """Both; none for an agent that draws nothing."""
+    if agent == "vagram":
+        raise InvalidInput("agent", agent, "draws no z, so there is no noise; use another")
+    return tuple(
+        Variant(noise, (*ablation.ADAPTIVE, "--value-alignment.noise", noise))
+        for noise in ("independent", "shared")
+    )
+
+
 ABLATION = ablation.Ablation(
     name="noise",
     title="Independent or shared noise of z and z~ in L_var.",
-    variants=lambda agent: VARIANTS,
+    variants=variants,
     quick=ablation.QUICK,
     paper=ablation.paper(*ablation.TABLE_3),
     factor="noise",

@@ -5,8 +5,10 @@
     python experiments/ablations/weight.py --agent storm --scale paper --tasks kung_fu_master
 
 The second is Table 3; the third is what Figs 9-11 are about, where the paper finds that a
-static weight of 50 aligns values at the cost of the dynamics. `ablation_weight_curves.png` has
-L_var before its weight, the weight itself and the KL of the latents over time.
+static weight of 50 aligns values at the cost of the dynamics. `ablation_weight_..._curves.png`
+has the dynamics loss, L_var before its weight, the weight itself and the KL of the latents over
+time, as Fig. 9; trajectories as in Figs 10 and 11 are `experiments/analyse.py --what
+trajectories --logdirs` of the runs.
 """
 
 from __future__ import annotations
@@ -32,7 +34,7 @@ VARIANTS = (
 )
 ABLATION = ablation.Ablation(
     name="weight",
-    title="The weight of value alignment (Table 3, Figs 9-11).",
+    title="The weight of value alignment (Table 3, Fig. 9).",
     variants=lambda agent: VARIANTS,
     quick=ablation.QUICK,
     paper=ablation.paper(*ablation.TABLE_3),

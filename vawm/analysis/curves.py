@@ -20,13 +20,14 @@ from vawm.tracking import Line
 
 METRICS = (
     "loss/dynamics",
+    "loss/value_gradient",
     "latent/kl",
     "value_alignment/loss",
     "value_alignment/kl",
     "value_alignment/weight",
 )
-"""Dynamics loss and KL; L_var of Eq. 4 without its weight, logged also where it is off; the KL
-of the critic's distributions; the weight of Eq. 5."""
+"""Dynamics loss, that of VaGraM, and KL; L_var of Eq. 4 without its weight, logged also where
+it is off; the KL of the critic's distributions; the weight of Eq. 5."""
 
 
 class Run(NamedTuple):

@@ -31,7 +31,7 @@ LABELS = {
     "reward": "|imagined reward - reward|",
     "value_kl": "KL of the critic's distributions (nats)",
     "latent_kl": "KL of posterior and prior (nats)",
-    "distance": "share of categoricals that differ",
+    "distance": "half squared distance of z, mean over categoricals",
 }
 MAPS = {
     "sensitivity": "decoder's sensitivity to z",

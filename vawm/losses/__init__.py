@@ -1,7 +1,8 @@
 """The losses, arrays in and arrays out: no network, environment or configuration.
 
-Every loss is per element; masks, weights and means are the caller's. Those that need
-derivatives of a model or a critic take it as a function. Equation numbers are the paper's.
+Losses are per element, and masks, weights and means are the caller's, but where a definition
+has them itself: `batch_dynamics_loss`, those along an unrolled model, and TEMPO. Those that
+need derivatives of a model or a critic take it as a function. Equation numbers are the paper's.
 
     prediction_loss, symlog_mse, image_mse, continue_loss     Eq. 3a  what the heads predict
     dynamics_loss, batch_dynamics_loss, balanced_kl           Eq. 3b  prior and posterior
@@ -9,6 +10,13 @@ derivatives of a model or a critic take it as a function. Equation numbers are t
     value_alignment_weight                                    Eq. 5   its adaptive weight
     critic_loss                                               Eq. 7   towards lambda-returns
     actor_loss, discount_weights                              Eq. 8   policy gradient
+
+What they are made of, from `vawm.returns` and `vawm.transforms`:
+
+    lambda_returns, replay_returns                            Eq. 7   targets of the critic
+    ReturnScale, init_return_scale, update_return_scale, return_scale
+                                                              Eq. 9   units of the advantage
+    make_two_hot, two_hot_cross_entropy, categorical_kl, symlog, symexp
 
 The value-aware family, from the publications that their docstrings name:
 
@@ -60,28 +68,54 @@ from vawm.losses.value_aware import (
     iter_vaml_loss,
     vaml_loss,
 )
+from vawm.returns import (
+    ReturnScale,
+    init_return_scale,
+    lambda_returns,
+    replay_returns,
+    return_scale,
+    update_return_scale,
+)
+from vawm.transforms import (
+    categorical_kl,
+    make_two_hot,
+    symexp,
+    symlog,
+    two_hot_cross_entropy,
+)
 
 __all__ = [
     "PredictionLoss",
+    "ReturnScale",
     "actor_loss",
     "balanced_kl",
     "batch_dynamics_loss",
     "categorical_iter_vaml_loss",
+    "categorical_kl",
     "continue_loss",
     "critic_loss",
     "cvaml_loss",
     "discount_weights",
     "dynamics_loss",
     "image_mse",
+    "init_return_scale",
     "iter_vaml_loss",
     "lambda_ac_loss",
+    "lambda_returns",
     "latent_consistency_loss",
+    "make_two_hot",
     "muzero_value_loss",
     "n_step_returns",
     "prediction_loss",
+    "replay_returns",
+    "return_scale",
     "scale_gradient",
+    "symexp",
+    "symlog",
     "symlog_mse",
     "tempo_meta_gradient",
+    "two_hot_cross_entropy",
+    "update_return_scale",
     "vagram_joint_loss",
     "vagram_loss",
     "vagram_second_order_loss",

@@ -44,7 +44,8 @@ def muzero_value_loss(values: Array, returns: Array, mask: Array) -> Array:
     `vawm.transforms.two_hot_cross_entropy` to the same returns.
 
     The critic is NOT frozen: this one loss trains model and critic. Where the environment
-    is stochastic its minimum is not at the true model.
+    is stochastic its minimum is not at the true model. The original trains on absorbing states
+    after an episode's end, with values of 0; with a `mask` they are left out instead.
 
     Args:
       values: `[K + 1, ...]` v_0..v_K.
@@ -69,7 +70,8 @@ def n_step_returns(reward: Array, discount: Array, value: Array, *, steps: int) 
 
     Args:
       reward: `[T, ...]` r_1..r_T.
-      discount: `[T, ...]` gamma at s_1..s_T, 0 where terminal.
+      discount: `[T, ...]` gamma at s_1..s_T, 0 where terminal. A window has to lie within one
+        episode up to a terminal state: past a time limit, rewards of the next one would count.
       value: `[T, ...]` v_1..v_T, in the units of the reward.
       steps: n, from 1 to T.
 
@@ -117,4 +119,5 @@ def latent_consistency_loss(prediction: Array, target: Array) -> Array:
 def _masked_squares(values: Array, targets: Array, mask: Array) -> Array:
     """`[H, ...]` squared errors of the values alone, 0 where masked."""
     targets, mask = jax.lax.stop_gradient((targets, mask))
-    return mask * jnp.square(values - targets)
+    # What is masked may be anything, so it is left out before it is squared.
+    return mask * jnp.square(jnp.where(mask == 0, 0.0, values - targets))

@@ -53,7 +53,7 @@ def vagram_taylor_loss(value: Value, prediction: Array, target: Array) -> Array:
 
 
 def vagram_second_order_loss(value: Value, prediction: Array, target: Array) -> Array:
-    """Bound on the squared error of the value to second order.
+    """Bound on the squared error of the value to second order; derived here.
 
         L = 2 (g . e)^2 + 1/2 (e' H e)^2  >=  (g . e + 1/2 e' H e)^2
 
@@ -77,7 +77,7 @@ def vagram_second_order_loss(value: Value, prediction: Array, target: Array) -> 
 
 
 def vagram_joint_loss(value: Value, prediction: Array, target: Array) -> Array:
-    """Second order with the diagonal first term: no cancelling between dims in either term.
+    """Second order with the diagonal first term, derived here: no cancelling between dims.
 
         L = 2 sum_j g_j^2 e_j^2 + 1/2 |H e|^2
 

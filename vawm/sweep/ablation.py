@@ -1,8 +1,9 @@
 """One ablation of the paper: its variants, its two scales, and the command line of them all.
 
-`quick` shows within minutes of a CPU that everything works, and how it looks; `paper` has the
+`quick` shows on a CPU that everything works, and how it looks; `paper` has the
 tasks and presets of the paper. Results are `ablation_<name>.csv`, `.md` and `.png`; with
-`_<agent>` for another agent than dreamerv3, and `_paper` for that scale.
+`_<agent>` for another agent than dreamerv3, `_paper` for that scale, and the tasks if they are
+named.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ class Scale(NamedTuple):
 
 
 QUICK = Scale("dmc_proprio", "quick", ("cartpole_swingup",), (0, 1, 2), env_steps=40_000)
-"""A third of the preset's run: some 4 minutes on one core for DreamerV3."""
+"""A third of the preset's run."""
 
 TABLE_3 = ("alien", "crazy_climber", "demon_attack", "bank_heist", "battle_zone")
 
@@ -72,11 +73,12 @@ class Ablation(NamedTuple):
 
 
 ALIGNMENT = {
+    "dynamics_loss": "loss/dynamics",
     "value_alignment_loss": "value_alignment/loss",
     "weight": "value_alignment/weight",
     "latent_kl": "latent/kl",
 }
-"""Column -> metric: L_var before its weight, the weight of Eq. 5, and KL[q || p] of z."""
+"""Column -> metric: Eq. 3b, L_var before its weight, the weight of Eq. 5, KL[q || p] of z."""
 
 ADAPTIVE = ("--value-alignment.weight", "adaptive")
 OFF = ("--value-alignment.weight", "off")
@@ -177,7 +179,8 @@ def result_name(ablation: Ablation, options: Options) -> str:
     """Of files and folders."""
     agent = "" if options.agent == "dreamerv3" else f"_{options.agent}"
     scale = "" if options.scale == "quick" else f"_{options.scale}"
-    return f"ablation_{ablation.name}{agent}{scale}"
+    tasks = "".join(f"_{task.replace('/', '-')}" for task in options.tasks)
+    return f"ablation_{ablation.name}{agent}{scale}{tasks}"
 
 
 def write(ablation: Ablation, options: Options, sweep: Sweep, made_by: str) -> str:

@@ -44,11 +44,18 @@ class Summary(NamedTuple):
 
 
 def read(sweep: Sweep, columns: Mapping[str, str] = RETURN) -> Rows:
-    """A row per line of metrics that has at least one of `columns`; the others are None."""
+    """A row per line of metrics that has at least one of `columns`; the others are None.
+
+    Of a run that went further than the sweep is long, the lines up to that length.
+    """
     rows = []
     for run in runs.all_runs(sweep):
         path = runs.folder(sweep, run) / "metrics.jsonl"
+        length, reached = runs.env_steps(sweep, run), 0
         for metrics in tracking.read(path) if path.exists() else ():
+            if length is not None and reached >= length:
+                break
+            reached = metrics["env_steps"]
             measured = {
                 name: rounded(name, metrics.get(metric)) for name, metric in columns.items()
             }
