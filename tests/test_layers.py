@@ -81,6 +81,7 @@ HOST = {
     "backends",
     "checkpoint",
     "command_line",
+    "diagnosis",
     "display",
     "evaluate",
     "export",

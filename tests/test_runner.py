@@ -18,10 +18,21 @@ import toy
 from runs import assert_same, events, files_of, lines, measured, quiet
 from tensorboardX.proto.event_pb2 import SessionLog
 
-from vawm import backends, checkpoint, envs, manifest, memory, runner, tracking
+from vawm import (
+    backends,
+    checkpoint,
+    diagnosis,
+    envs,
+    manifest,
+    memory,
+    replay,
+    runner,
+    tracking,
+)
 from vawm.errors import InvalidInput
 from vawm.program import Program
 from vawm.runner import RunError
+from vawm.types import Trajectory
 
 LONG = tiny.config(env_steps=192)
 
@@ -58,6 +69,18 @@ class FakeStep:
         }
 
 
+def stored(reward=()):
+    """Replay of two environments, 4 steps each, whose last rewards are `reward`, `[N, K]`."""
+    zeros = jnp.zeros(2)
+    example = Trajectory(zeros[:, None], zeros, zeros > 0, zeros > 0, zeros > 0, zeros[:, None])
+    buffer = replay.init(example, (), capacity=4)
+    steps = jax.tree.map(lambda x: jnp.stack([x] * 4, 1), example)
+    buffer = replay.add(buffer, steps, ())  # and wraps with what follows
+    reward = jnp.asarray(reward or jnp.zeros((2, 0)), jnp.float32)
+    steps = jax.tree.map(lambda x: x[:, : reward.shape[1]], steps)
+    return replay.add(buffer, steps._replace(reward=reward), ())
+
+
 @pytest.fixture
 def fake(monkeypatch):
     """Puts a `FakeStep` with the given losses in place of training."""
@@ -67,7 +90,7 @@ def fake(monkeypatch):
             spec=toy.SPEC,
             agent=None,
             shapes=None,
-            init=lambda seed: toy.state(),
+            init=lambda seed: toy.state()._replace(replay=stored()),
             compile=lambda state: FakeStep(loss),
             episodes=lambda: None,
             resume=lambda state, _: (state, 0),
@@ -211,6 +234,63 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_checkpoint(
         run(tiny.CONFIG, tmp_path)
     assert checkpoint.latest(tmp_path).name == "000000000032"
     assert lines(tmp_path)[-1]["loss/critic"] is None
+    found = json.loads((tmp_path / "diagnosis.json").read_text())
+    optimizer, last = found.pop("optimizer"), found.pop("last_finite_line")
+    assert optimizer["learning_rate"] == tiny.CONFIG.optimizer.learning_rate
+    assert (last["env_steps"], last["loss/critic"]) == (32, 1.0)
+    assert found == {
+        "loss": "loss/critic",
+        "value": str(value),
+        "env_steps": 48,
+        "updates": 6,
+        "nonfinite_metrics": {"loss/critic": str(value)},
+        "nonfinite_parameters": [],
+        "nonfinite_replay": [],
+    }
+
+
+def test_what_replay_holds_that_is_not_finite_is_named_by_environment_and_step():
+    nan, inf = math.nan, math.inf
+    assert diagnosis.nonfinite_replay(stored([[1.0, nan, 2.0], [-inf, 0.0, nan]])) == [
+        {"field": "reward", "environment": 1, "steps_ago": 2, "steps": 3}
+    ]
+    assert not diagnosis.nonfinite_replay(stored([[1e30], [-1e30]]))
+
+
+def test_rewards_that_are_nan_in_replay_stop_the_run_and_are_named(tmp_path, monkeypatch):
+    """As an environment of one's own on the device could leave them there: nobody looks at
+    what it returns before that is learned from."""
+    prepare, chunks = runner.prepare, []
+
+    def poisoned(*arguments):
+        program = prepare(*arguments)
+
+        def compile_step(state):
+            step = program.compile(state)
+
+            def call(state):
+                chunks.append(len(chunks))
+                if len(chunks) == 4:  # the first 8 steps of the second environment
+                    reward = state.replay.trajectory.reward.at[1, :8].set(jnp.nan)
+                    trajectory = state.replay.trajectory._replace(reward=reward)
+                    state = state._replace(replay=state.replay._replace(trajectory=trajectory))
+                return step(state)
+
+            return call
+
+        return program._replace(compile=compile_step)
+
+    monkeypatch.setattr(runner, "prepare", poisoned)
+    with pytest.raises(RunError, match=r"loss/.* is nan at .*; more in .*diagnosis.json"):
+        run(tiny.CONFIG, tmp_path)
+    found = json.loads((tmp_path / "diagnosis.json").read_text())
+    ago = 4 * len(chunks) - 1  # 4 calls in a chunk
+    assert found["nonfinite_replay"] == [
+        {"field": "reward", "environment": 1, "steps_ago": ago, "steps": 8}
+    ]
+    assert any(".critic" in name for name in found["nonfinite_parameters"])
+    for path in checkpoint.complete(tmp_path):
+        assert int(path.name) < found["env_steps"]
 
 
 def test_a_run_that_was_killed_before_its_first_checkpoint_starts_again(tmp_path, fake):

@@ -136,6 +136,6 @@ def put_aside(logdir: pathlib.Path) -> pathlib.Path | None:
 def clear(logdir: pathlib.Path) -> None:
     """Removes what a run measured that saved nothing; it is about to measure it again."""
     lines = ("metrics.jsonl*", "checkpoints.jsonl*", "videos.jsonl*")
-    for pattern in (*lines, "events.out.tfevents.*", "videos/*"):
+    for pattern in (*lines, "events.out.tfevents.*", "videos/*", "diagnosis.json"):
         for path in logdir.glob(pattern):
             path.unlink()

@@ -9,12 +9,11 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import math
 import os
 import pathlib
 import time
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 import jax
 import rich.console
@@ -22,6 +21,7 @@ import rich.console
 from vawm import (
     backends,
     checkpoint,
+    diagnosis,
     memory,
     rundir,
     signals,
@@ -259,7 +259,8 @@ def _loop(
             metrics = jax.device_get(metrics)
             progress = advance(progress, metrics, began=began)
             saver.check()
-            _stop_if_nonfinite(metrics, progress, tracker, saver)
+            if diagnosis.first_nonfinite(metrics):
+                _stop(config, logdir, state, metrics, progress, tracker, saver)
             done = progress.env_steps >= config.env_steps
             if _crossed(before, progress.env_steps, config.log_every):
                 line = _line(progress)
@@ -326,24 +327,25 @@ def _append(path: pathlib.Path, line: Line) -> None:
         file.write(tracking.as_json(line) + "\n")
 
 
-def _stop_if_nonfinite(
+def _stop(
+    config: Config,
+    logdir: pathlib.Path,
+    state: PyTree,
     metrics: Mapping[str, Any],
     progress: Progress,
     tracker: tracking.Tracker,
     saver: checkpoint.Saver,
-) -> None:
+) -> NoReturn:
     """A loss that is not finite never comes back: better no run than a wrong one."""
-    if not int(metrics["chunk/updates"]):
-        return
-    for name, value in metrics.items():
-        if name.startswith("loss/") and not math.isfinite(value):
-            tracker.write(_line(progress))
-            saver.wait()
-            raise RunError(
-                f"{name} is {float(value)} at env_steps={progress.env_steps}; "
-                f"kept: {_kept(saver.logdir)}. "
-                "Start again with a smaller --optimizer.learning-rate or another --seed"
-            )
+    tracker.write(_line(progress))
+    written = diagnosis.write(logdir, config, state, metrics)
+    saver.wait()
+    name = diagnosis.first_nonfinite(metrics)
+    raise RunError(
+        f"{name} is {float(metrics[str(name)])} at env_steps={progress.env_steps}; "
+        f"kept: {_kept(logdir)}; more in {written}. "
+        "Start again with a smaller --optimizer.learning-rate or another --seed"
+    )
 
 
 @contextlib.contextmanager

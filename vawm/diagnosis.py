@@ -1,0 +1,110 @@
+"""What is known of a run whose loss is not finite, for whoever looks for the reason."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import pathlib
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vawm import checkpoint, tracking
+from vawm.config import Config
+from vawm.replay import Replay
+from vawm.tracking import METRICS, Line
+from vawm.train import TrainState
+from vawm.types import Array
+
+FILE = "diagnosis.json"
+
+
+def first_nonfinite(metrics: Mapping[str, Any]) -> str | None:
+    """The name of the first loss of a chunk that is not finite; None if all are, or it had
+    no update."""
+    if not int(metrics["chunk/updates"]):
+        return None
+    losses = (name for name in metrics if name.startswith("loss/"))
+    return next((name for name in losses if not math.isfinite(metrics[name])), None)
+
+
+def write(
+    logdir: pathlib.Path, config: Config, state: TrainState, metrics: Mapping[str, Any]
+) -> pathlib.Path:
+    """Writes `diagnosis.json` about the chunk that led to `state` and measured `metrics`.
+
+    It names the loss and its value, env steps and updates, the optimiser's choices, every
+    metric of the chunk that is not finite, the last line of metrics whose losses are all
+    finite, the parameters that are not finite, and what replay holds that is not: that
+    came from the environments, or from the policy.
+
+    Raises:
+      OSError: it cannot be written.
+    """
+    loss = first_nonfinite(metrics)
+    broken = {name: str(float(x)) for name, x in metrics.items() if not math.isfinite(x)}
+    params = checkpoint.flatten(state.learner.params)
+    content = {
+        "loss": loss,
+        "value": broken.get(str(loss)),
+        "env_steps": int(metrics["env_steps"]),
+        "updates": int(metrics["updates"]),
+        "optimizer": dataclasses.asdict(config.optimizer),
+        "nonfinite_metrics": broken,
+        "last_finite_line": last_finite_line(logdir),
+        "nonfinite_parameters": [name for name, x in params.items() if not _is_finite(x)],
+        "nonfinite_replay": nonfinite_replay(state.replay),
+    }
+    path = logdir / FILE
+    path.write_text(json.dumps(content, indent=2) + "\n")
+    return path
+
+
+def last_finite_line(logdir: pathlib.Path) -> Line | None:
+    """The last line of metrics that has losses, all of them finite."""
+    for line in reversed(tracking.read(logdir / METRICS)):
+        losses = [value for name, value in line.items() if name.startswith("loss/")]
+        if losses and None not in losses:  # null is what is not finite
+            return line
+    return None
+
+
+def nonfinite_replay(replay: Replay) -> list[dict[str, Any]]:
+    """Per field of the trajectory where it is not finite: in which environment first, how many
+    steps of that environment ago, and in how many steps of all.
+
+    Counted back from the newest step, which is 0 steps ago. One reduction to `[N, C]` each.
+    """
+    capacity = replay.trajectory.reward.shape[1]
+    newest = int(replay.head) - 1
+    found = []
+    for name, leaf in checkpoint.flatten(replay.trajectory).items():
+        if not jnp.issubdtype(leaf.dtype, jnp.floating) or not leaf.size:
+            continue
+        envs, slots = np.nonzero(~np.asarray(_finite_steps(leaf)))
+        if not len(envs):
+            continue
+        ago = (newest - slots) % capacity
+        oldest = int(np.argmax(ago))
+        found.append(
+            {
+                "field": name.lstrip("."),
+                "environment": int(envs[oldest]),
+                "steps_ago": int(ago[oldest]),
+                "steps": len(envs),
+            }
+        )
+    return found
+
+
+@jax.jit
+def _finite_steps(x: Array) -> Array:
+    return jnp.isfinite(x).all(range(2, x.ndim))
+
+
+def _is_finite(x: Array) -> bool:
+    return bool(jnp.isfinite(x).all())
