@@ -236,6 +236,72 @@ def test_an_environment_that_may_restart_does_and_is_counted(tmp_path):
     np.testing.assert_array_equal(first, clock == 0)
 
 
+class Lost(Lamp):
+    """Loses the reward of every second step, or one entry of the clock."""
+
+    fields = {"reward": np.nan}  # noqa: RUF012
+
+    def step(self, action):
+        outcome = super().step(action)
+        if self.steps == 2 and "clock" in self.fields:
+            outcome.obs["clock"][0] = self.fields["clock"]
+        if self.steps == 2 and "reward" in self.fields:
+            outcome = outcome._replace(reward=self.fields["reward"])
+        return outcome
+
+
+class LostClock(Lost):
+    fields = {"clock": np.inf}  # noqa: RUF012
+
+
+class LostBelow(Lost):
+    fields = {"clock": -np.inf}  # noqa: RUF012
+
+
+@pytest.mark.parametrize(
+    ("make", "reason"),
+    [
+        (Lost, "reward is nan"),
+        (LostClock, r"obs\['clock'\]\[0\] is inf"),
+        (LostBelow, r"obs\['clock'\]\[0\] is -inf"),
+    ],
+)
+def test_what_is_not_finite_ends_the_run_with_environment_step_and_field(
+    tmp_path, make, reason
+):
+    with pytest.raises(runner.RunError, match=f"environment 0, episode 0, step 2: {reason}"):
+        run(tiny_pixels.CONFIG, tmp_path, tiny_pixels.pool(make))
+
+
+def test_where_environments_may_restart_what_is_not_finite_is_never_learned_from(tmp_path):
+    """Every episode is broken off before its second step, and never three times in a row."""
+    pool = tiny_pixels.pool(Lost, on_failure="restart")
+    assert run(tiny_pixels.CONFIG, tmp_path, pool).env_steps >= 96
+    assert sum(line["env/restarts"] for line in lines(tmp_path)) > 20
+    with tiny_pixels.pool() as env:
+        shapes = program.make(tiny_pixels.CONFIG, env).shapes
+    state, _ = checkpoint.restore(tmp_path, shapes)
+    assert not np.asarray(state.replay.trajectory.is_last).any()
+    for leaf in jax.tree.leaves((state.learner.params, state.replay)):
+        assert np.isfinite(leaf).all()
+
+
+class Huge(Lost):
+    """Numbers that float32 can just about hold, and whose squares it cannot."""
+
+    fields = {"clock": 1e30, "reward": -1e30}  # noqa: RUF012
+
+
+def test_huge_observations_and_rewards_are_learned_from_and_all_stays_finite(tmp_path):
+    assert run(tiny_pixels.CONFIG, tmp_path, tiny_pixels.pool(Huge)).env_steps == 96
+    with tiny_pixels.pool() as env:
+        shapes = program.make(tiny_pixels.CONFIG, env).shapes
+    state, _ = checkpoint.restore(tmp_path, shapes)
+    assert (np.asarray(state.replay.trajectory.obs["clock"]) == np.float32(1e30)).any()
+    for leaf in jax.tree.leaves(state.learner):
+        assert np.isfinite(leaf).all()
+
+
 def test_environments_are_closed_whatever_happens(tmp_path):
     for make in (Lamp, Broken):
         env = tiny_pixels.pool(make)
