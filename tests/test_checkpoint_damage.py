@@ -186,23 +186,30 @@ def harms(rng):
     return (bit, bit, bit, cut, zeros, noise, inserted, another, folder, gone)
 
 
-def test_none_of_500_random_corruptions_restores_wrong_values(saved, tmp_path):
-    rng = random.Random(0)
-    shutil.copytree(checkpoint.complete(saved)[-1], tmp_path / "checkpoints" / "000000000008")
-    files, expected = files_of(tmp_path), toy.state(8)
+def corrupt(logdir, expected, count, rng):
+    """Does something to the only checkpoint, which holds `expected`, `count` times.
+
+    Returns how often that was refused, as it has to be where a file has changed.
+    """
+    files = files_of(logdir)
     contents = {file: file.read_bytes() for file in files}
     refused = 0
-    for _ in range(500):
+    for _ in range(count):
         file, harm = rng.choice(files), rng.choice(harms(rng))
         harm(file, files)
         if file.is_file() and file.read_bytes() == contents[file]:
-            toy.assert_equal(checkpoint.restore(tmp_path, expected)[0], expected)
+            toy.assert_equal(checkpoint.restore(logdir, expected)[0], expected)
         else:
             with pytest.raises(InvalidInput) as error:
-                checkpoint.restore(tmp_path, expected)
+                checkpoint.restore(logdir, expected)
             assert "\n" not in str(error.value)
             refused += 1
         if file.is_dir():
             file.rmdir()
         file.write_bytes(contents[file])
-    assert refused > 450
+    return refused
+
+
+def test_none_of_500_random_corruptions_restores_wrong_values(saved, tmp_path):
+    shutil.copytree(checkpoint.complete(saved)[-1], tmp_path / "checkpoints" / "000000000008")
+    assert corrupt(tmp_path, toy.state(8), 500, random.Random(0)) > 450
