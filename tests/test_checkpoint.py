@@ -1,6 +1,9 @@
 """Checkpoints: bit for bit, all or nothing, never a silent difference."""
 
 import errno
+import gc
+import logging
+import resource
 import shutil
 from typing import Any, NamedTuple
 
@@ -191,6 +194,31 @@ def test_a_full_disk_leaves_the_previous_checkpoint_alone(tmp_path, monkeypatch)
     monkeypatch.undo()
     assert list(checkpoint.root(tmp_path).iterdir()) == [first]
     toy.assert_equal(checkpoint.restore(tmp_path, toy.state())[0], toy.state())
+
+
+# TensorStore may still want to tell the loop that Orbax has closed.
+@pytest.mark.filterwarnings("ignore:.*:pytest.PytestUnraisableExceptionWarning")
+def test_what_cannot_be_written_is_one_error_and_no_pages_of_traces(tmp_path, caplog):
+    """Files may not grow beyond what all but one array need, as Orbax's threads find out."""
+    save_toy(tmp_path, toy.state(8), 8)
+    noise = jnp.asarray(np.random.default_rng(0).normal(size=100_000), jnp.float32)
+    large = toy.state(16)._replace(replay=noise)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
+    try:
+        with pytest.raises(
+            checkpoint.SaveError, match=r"MiB free\): .* File too large$"
+        ) as error:
+            save_toy(tmp_path, large, 16)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert "\n" not in str(error.value)
+    del error
+    gc.collect()
+    assert not caplog.records
+    assert [path.name for path in checkpoint.root(tmp_path).iterdir()] == ["000000000008"]
+    logging.getLogger("absl").warning("is heard again")
+    assert [record.getMessage() for record in caplog.records] == ["is heard again"]
 
 
 def test_parameters_that_are_not_finite_are_not_saved(tmp_path):

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import logging
 import pathlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import jax
@@ -50,6 +52,27 @@ def read(path: pathlib.Path, expected: Mapping[str, LeafInfo]) -> dict[str, np.n
         if (arrays[name].shape, str(arrays[name].dtype)) != (info.shape, info.dtype):
             raise Damaged(path, f"holds another {name} than the manifest says")
     return arrays
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """Keeps Orbax and what it runs on from logging, for the whole process.
+
+    Where it cannot write, it logs a trace for every array, hundreds of lines on a full disk,
+    and raises the error as well.
+    """
+    loggers = [logging.getLogger(name) for name in ("absl", "asyncio")]
+    for logger in loggers:
+        logger.addFilter(_nothing)
+    try:
+        yield
+    finally:
+        for logger in loggers:
+            logger.removeFilter(_nothing)
+
+
+def _nothing(record: logging.LogRecord) -> bool:
+    return False
 
 
 def _compare(path: pathlib.Path, found: Any, expected: Mapping[str, LeafInfo]) -> None:

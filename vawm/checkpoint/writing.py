@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import os
 import pathlib
+import re
 import shutil
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -71,19 +72,20 @@ def write(logdir: str | os.PathLike[str], taken: Snapshot) -> Written:
     refuse_backwards(logdir, taken.env_steps)
     _refuse_nonfinite(taken.arrays.get("params", {}) | taken.arrays.get("model_state", {}))
     scratch = final.with_name(folders.SCRATCH + final.name)
-    try:
-        shutil.rmtree(scratch, ignore_errors=True)
-        scratch.mkdir(parents=True)
-        for item in taken.leaves:
-            arrays.write(scratch / item, taken.arrays[item])
-        nbytes = manifest_lib.write(scratch, _manifest(taken))
-        scratch.rename(final)
-        folders.sync(final.parent)
-    except Exception as error:
-        shutil.rmtree(scratch, ignore_errors=True)
-        raise SaveError(_why_not_saved(final, taken.nbytes, error)) from error
-    finally:
-        gc.collect(1)  # Orbax leaves young cycles that hold all of it, compressed
+    with arrays.quiet():
+        try:
+            shutil.rmtree(scratch, ignore_errors=True)
+            scratch.mkdir(parents=True)
+            for item in taken.leaves:
+                arrays.write(scratch / item, taken.arrays[item])
+            nbytes = manifest_lib.write(scratch, _manifest(taken))
+            scratch.rename(final)
+            folders.sync(final.parent)
+        except Exception as error:
+            shutil.rmtree(scratch, ignore_errors=True)
+            raise SaveError(_why_not_saved(final, taken.nbytes, error)) from error
+        finally:
+            gc.collect(1)  # Orbax leaves young cycles that hold all of it, compressed
     folders.prune(logdir, taken.config.keep_checkpoints)
     return Written(final, nbytes)
 
@@ -124,6 +126,8 @@ def _refuse_nonfinite(needed: Mapping[str, np.ndarray]) -> None:
 def _why_not_saved(final: pathlib.Path, needed: int, error: Exception) -> str:
     free = shutil.disk_usage(final.parents[1]).free
     reason = (str(error).strip() or repr(error)).splitlines()[0]
+    # TensorStore names file after file before what the system said, and its choices after.
+    reason = re.split(r" \[\w+='", reason)[0].rpartition('": ')[-1]
     return (
         f"checkpoint {final} could not be written (up to {needed / 2**20:.0f} MiB needed, "
         f"{free / 2**20:.0f} MiB free): {reason[:200]}"
