@@ -115,6 +115,7 @@ import json
 import os
 import pathlib
 import random
+import re
 import shutil
 import signal
 import subprocess
@@ -363,10 +364,10 @@ def fill(disk: pathlib.Path, save_every: int) -> str:
                     file.write(bytes(1024))
             time.sleep(0.001)
         code, output = child.process.returncode, child.said()
-    lines = output.strip().splitlines()
-    last = lines[-1]
     assert code == 1, output[-2000:]
-    assert "No space left" in last, output[-2000:]
+    told = [line for line in output.splitlines() if "No space left" in line]
+    assert len(told) == 1, output[-2000:]
+    assert re.match(rf"(checkpoint )?{logdir}", told[0]), told
     scratch = list(checkpoint.root(logdir).glob(f"{checkpoint.SCRATCH}*"))
     assert not scratch, scratch
     newest = checkpoint.latest(logdir)
@@ -377,7 +378,7 @@ def fill(disk: pathlib.Path, save_every: int) -> str:
     finish(logdir, end, save_every)
     check_metrics(logdir, end)
     kept = f"kept {int(newest.name)}" if newest else "no checkpoint yet"
-    return f"{last.replace(str(logdir), 'LOGDIR')[:100]}... ({kept}, and went on)"
+    return f"{told[0].replace(str(logdir), 'LOGDIR')} ({kept}, and went on)"
 
 
 def fuzz(folder: pathlib.Path, count: int = 2000) -> Outcome:
