@@ -7,9 +7,9 @@
 
 Models are up to three of the smallest of the agent: 1m, 12m and 25m of DreamerV3, 1m and 16m of
 STORM. Images are 64, 96 and 128 pixels a side, in the paper at its preset's size. VaGraM is
-what value alignment is compared with, so `--agent vagram` has no L_var. The quick scale is so short,
-for the sake of the large ones, that it shows no more than that everything works: nothing is
-learnt in it.
+what value alignment is compared with, so `--agent vagram` has no L_var. The quick scale is so
+short, for the sake of the large ones, that it shows no more than that everything works: nothing
+is learnt in it.
 """
 
 from __future__ import annotations
