@@ -143,19 +143,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = flags.read(Options, argv, description=__doc__)
     sweep = make_sweep(options)
     check(options, sweep)
-    failed: list = []
-    if not options.collect_only:
-        outcome = children.run(runs.unfinished_jobs(sweep), at_once=options.jobs)
-        if outcome.exit_code:
-            print("stopped; the same command goes on")
-            return outcome.exit_code
-        failed = outcome.failed
-    rows = results.read(sweep)
-    write(rows, options, sweep)
-    print(summary(rows, sweep))
-    for job, code in failed:
-        print(f"error: {job.name} ended with exit code {code}, see {job.log}", file=sys.stderr)
-    return 1 if failed else 0
+
+    def report() -> None:
+        rows = results.read(sweep)
+        write(rows, options, sweep)
+        print(summary(rows, sweep))
+
+    jobs = [] if options.collect_only else runs.unfinished_jobs(sweep)
+    return children.run_then(jobs, report, at_once=options.jobs)
 
 
 if __name__ == "__main__":

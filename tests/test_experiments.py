@@ -179,7 +179,9 @@ def test_nothing_is_written_when_the_runs_were_stopped(options, monkeypatch, cap
 
 
 def test_a_missing_matplotlib_is_told_before_anything_is_trained(options, monkeypatch, capsys):
-    monkeypatch.setattr(curves.runs.importlib.util, "find_spec", lambda _: None)
+    monkeypatch.setattr(
+        curves.runs.analysis_figures.importlib.util, "find_spec", lambda _: None
+    )
     monkeypatch.setattr(curves.children, "run", None)
     assert command_line.guard(lambda: curves.main(words(options))) == 1
     assert "pip install matplotlib" in capsys.readouterr().err

@@ -72,6 +72,17 @@ def linear_losses(loss, critic, model):
     return loss(values, jnp.array([1.0, 0.0, 2.0]), jnp.ones(3))
 
 
+@pytest.mark.parametrize("loss", [lambda_ac_loss, muzero_value_loss])
+@pytest.mark.parametrize("anything", [np.nan, np.inf])
+def test_what_is_masked_may_be_anything(loss, anything):
+    values, targets, mask = (jnp.asarray(x) for x in batch(5))
+    assert (mask == 0).any()
+    spoiled = jnp.where(mask == 0, anything, values)
+    run = jax.value_and_grad(lambda x: loss(x, targets, mask).sum())
+    for actual, expected in zip(run(spoiled), run(values), strict=True):
+        np.testing.assert_array_equal(actual, expected)
+
+
 def test_muzero_trains_model_and_critic():
     gradient = jax.grad(linear_losses, argnums=(1, 2))
     to_critic, to_model = gradient(

@@ -171,6 +171,15 @@ def test_seeds_that_are_missing_are_named_and_not_averaged(finished):
     assert failed.area == [2.0]
 
 
+def test_a_shorter_sweep_reads_its_own_length_of_runs_that_went_further(finished):
+    sweep, _ = finished
+    shorter = runs.dataclasses.replace(sweep, env_steps=30)
+    rows = results.read(shorter)
+    assert {row["env_steps"] for row in rows} == {32}  # a run ends where it reaches its length
+    done, _ = results.summarise(shorter, rows)
+    assert done.last == {"return": [1.0, 2.0]}
+
+
 def test_the_table_is_the_one_worked_by_hand(finished):
     sweep, _ = finished
     columns = results.RETURN | {"the_loss": "loss"}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Callable
 from typing import Literal, NamedTuple
@@ -11,7 +12,9 @@ import jax
 from vawm import checkpoint, validate, weights
 from vawm.agent import PolicyCarry, make_agent
 from vawm.config import Config
+from vawm.manifest import Manifest
 from vawm.types import Array, EnvSpec, Key, Params, PyTree, TimeStep
+from vawm.weights import Description
 
 
 class Policy(NamedTuple):
@@ -61,18 +64,7 @@ def load(logdir: str | os.PathLike[str]) -> Policy:
     found = checkpoint.usable(logdir, checkpoint.ACTING)
     manifest = found.manifest
     validate.check_spec(manifest.config, manifest.spec)
-    agent = make_agent(manifest.config, manifest.spec)
-    target = jax.eval_shape(agent.init, jax.random.key(0))
-    params, state = checkpoint.read_agent(found, *target)
-    return Policy(
-        config=manifest.config,
-        spec=manifest.spec,
-        env_steps=manifest.env_steps,
-        params=params,
-        state=state,
-        initial=agent.initial,
-        apply=jax.jit(agent.act, static_argnames="how"),
-    )
+    return _policy(manifest, functools.partial(checkpoint.read_agent, found))
 
 
 def import_policy(folder: str | os.PathLike[str]) -> Policy:
@@ -82,13 +74,19 @@ def import_policy(folder: str | os.PathLike[str]) -> Policy:
       InvalidInput: a file is missing or damaged, or the weights are not those of its config.
     """
     description = weights.describe(folder)
-    agent = make_agent(description.config, description.spec)
-    target = jax.eval_shape(agent.init, jax.random.key(0))
-    params, state = weights.read(folder, description, *target)
+    return _policy(description, functools.partial(weights.read, folder, description))
+
+
+def _policy(
+    of: Manifest | Description, read: Callable[[PyTree, PyTree], tuple[PyTree, PyTree]]
+) -> Policy:
+    """The policy that `of` describes; `read` fills shapes of parameters and state."""
+    agent = make_agent(of.config, of.spec)
+    params, state = read(*jax.eval_shape(agent.init, jax.random.key(0)))
     return Policy(
-        config=description.config,
-        spec=description.spec,
-        env_steps=description.env_steps,
+        config=of.config,
+        spec=of.spec,
+        env_steps=of.env_steps,
         params=params,
         state=state,
         initial=agent.initial,

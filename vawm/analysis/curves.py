@@ -108,14 +108,23 @@ def curve(runs: Sequence[Run], metric: str) -> Curve | None:
     ]
     if not all(points):
         return None
-    series = [np.asarray(own, np.float64).T for own in points]
+    steps, values = aligned([np.asarray(own, np.float64).T for own in points])
+    if not len(steps):
+        return None
+    return Curve(steps, values.mean(0), values.min(0), values.max(0), len(runs))
+
+
+def aligned(series: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """`[P]` steps at which any of the series has a value and which all reach around, and
+    `[S, P]` the values of each there, straight between its own.
+
+    Args:
+      series: each `[2, n]`, steps and values; at least one, none empty.
+    """
     begin, end = max(s[0][0] for s in series), min(s[0][-1] for s in series)
     steps = np.unique(np.concatenate([s[0] for s in series]))
     steps = steps[(steps >= begin) & (steps <= end)]
-    if not len(steps):
-        return None
-    values = np.stack([np.interp(steps, *s) for s in series])
-    return Curve(steps, values.mean(0), values.min(0), values.max(0), len(runs))
+    return steps, np.stack([np.interp(steps, *s) for s in series])
 
 
 Curves = dict[str, dict[str, Curve]]

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 import pathlib
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
@@ -132,17 +131,12 @@ def run(ablation: Ablation, options: Options, *, script: str) -> int:
     """
     sweep = make_sweep(ablation, options, pathlib.Path(script).resolve().parents[1])
     check(ablation, options, sweep)
-    failed: list = []
-    if not options.collect_only:
-        outcome = children.run(runs.unfinished_jobs(sweep), at_once=options.jobs)
-        if outcome.exit_code:
-            print("stopped; the same command goes on")
-            return outcome.exit_code
-        failed = outcome.failed
-    print(write(ablation, options, sweep, command(options, script)))
-    for job, code in failed:
-        print(f"error: {job.name} ended with exit code {code}, see {job.log}", file=sys.stderr)
-    return 1 if failed else 0
+
+    def report() -> None:
+        print(write(ablation, options, sweep, command(options, script)))
+
+    jobs = [] if options.collect_only else runs.unfinished_jobs(sweep)
+    return children.run_then(jobs, report, at_once=options.jobs)
 
 
 def scale_of(ablation: Ablation, options: Options) -> Scale:

@@ -6,8 +6,9 @@ import contextlib
 import os
 import pathlib
 import subprocess
+import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from vawm import signals
@@ -63,6 +64,22 @@ def run(jobs: Sequence[Job], *, at_once: int) -> Outcome:
             for _, process in running.values():
                 process.wait()
         return Outcome(failed, stop.exit_code)
+
+
+def run_then(jobs: Sequence[Job], report: Callable[[], None], *, at_once: int) -> int:
+    """Runs the jobs, then reports, of whichever succeeded; not after a signal.
+
+    Returns:
+      The exit code of a program that does no more: 1 if a job failed.
+    """
+    outcome = run(jobs, at_once=at_once)
+    if outcome.exit_code:
+        print("stopped; the same command goes on")
+        return outcome.exit_code
+    report()
+    for job, code in outcome.failed:
+        print(f"error: {job.name} ended with exit code {code}, see {job.log}", file=sys.stderr)
+    return 1 if outcome.failed else 0
 
 
 def _ended(running: dict[int, tuple[Job, subprocess.Popen]]) -> list[tuple[Job, int]]:

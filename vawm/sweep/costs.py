@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import pathlib
 import statistics
 from collections.abc import Sequence
@@ -10,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from vawm import flags, overhead
+from vawm.analysis.tables import write_csv
 from vawm.envs.protocol import check_positive
 from vawm.overhead import Measured, percent_more, quartiles
 from vawm.sweep import ablation, runs
@@ -104,6 +104,7 @@ def markdown(rows: Rows, *, notes: str, command: str) -> str:
     """The table, what it is of, and what made it."""
     heads = ["task", "value alignment", "s per sample", "overhead", "peak memory", "hours"]
     lines = [notes, "", HOW_TO_READ, "", line(heads), line(["---"] * len(heads))]
+    base = rows[-1]["variant"]
     for row in rows:
         values = [
             f"{row['seconds']:.4g} ({row['seconds_first_quartile']:.4g} to "
@@ -113,8 +114,7 @@ def markdown(rows: Rows, *, notes: str, command: str) -> str:
             f"{row['peak_gib']:.2f} GiB ({row['more_memory_percent']:+.1f} %)",
             f"{row['run_hours']:.3g}",
         ]
-        base = row["overhead_percent"] == 0.0 == row["more_memory_percent"]
-        if base:
+        if row["variant"] == base:
             values[1], values[2] = "-", f"{row['peak_gib']:.2f} GiB"
         lines.append(line([row["task"], row["variant"], *values]))
     sample = "; ".join(
@@ -123,16 +123,6 @@ def markdown(rows: Rows, *, notes: str, command: str) -> str:
         for row in {row["task"]: row for row in rows}.values()
     )
     return "\n".join([*lines, "", f"{sample}.", "", f"Made by `{command}`.", ""])
-
-
-def write_csv(rows: Rows, path: pathlib.Path) -> None:
-    """All that was measured, 6 digits of each number."""
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(rows[0])
-        for row in rows:
-            cells = row.values()
-            writer.writerow([f"{x:.6g}" if isinstance(x, float) else x for x in cells])
 
 
 def plot(rows: Rows, sweep: Sweep, path: pathlib.Path) -> None:

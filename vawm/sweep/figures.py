@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 
+from vawm.analysis.curves import aligned
 from vawm.sweep.results import Rows, of_run
 from vawm.sweep.runs import Run, Sweep
 
@@ -77,13 +78,9 @@ def _band(panel, curves: Sequence[Rows], quantity: str, color: str, label: str) 
 
 
 def interpolated(curves: Sequence[Rows], quantity: str) -> tuple[np.ndarray, np.ndarray]:
-    """`[N]` env steps at which any of the curves has a value and all lie around, and `[S, N]`
-    the values of each there, straight between its own."""
+    """`aligned` values of a quantity, `[N]` env steps and `[S, N]`; none of no curves."""
     if not curves:
         return np.zeros(0), np.zeros((0, 0))
-    steps = [np.array([row["env_steps"] for row in rows]) for rows in curves]
-    values = [np.array([row[quantity] for row in rows]) for rows in curves]
-    grid = np.unique(np.concatenate(steps))
-    first, last = max(s[0] for s in steps), min(s[-1] for s in steps)
-    grid = grid[(grid >= first) & (grid <= last)]
-    return grid, np.stack([np.interp(grid, s, v) for s, v in zip(steps, values, strict=True)])
+    return aligned(
+        [np.array([(row["env_steps"], row[quantity]) for row in own]).T for own in curves]
+    )

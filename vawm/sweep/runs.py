@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
 import itertools
 import pathlib
 import re
@@ -13,10 +12,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from vawm import checkpoint, command_line, rundir, suites, validate
+from vawm.analysis import figures as analysis_figures
 from vawm.config import Config
 from vawm.envs.protocol import check_positive
 from vawm.errors import InvalidInput
-from vawm.runner import RunError
 from vawm.sweep.children import Job
 
 PROGRAMS = {
@@ -164,5 +163,4 @@ def check_places(*, jobs: int, runs: pathlib.Path | None, results: pathlib.Path)
     rundir.check_writable(results, "results")
     if runs is not None:
         rundir.check_writable(runs, "runs")
-    if importlib.util.find_spec("matplotlib") is None:
-        raise RunError("matplotlib is missing: pip install matplotlib (or vawm[notebooks])")
+    analysis_figures.check()
