@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import jax
+import jax.numpy as jnp
 
 from vawm.distributions import Policy
 from vawm.types import Imagined, Key, Latent, PyTree
@@ -24,9 +25,8 @@ def imagine(
 ) -> Imagined:
     """Follow `policy` for `horizon` steps from N starts; no gradient leaves here.
 
-    The scan emits the latent that each step starts from and runs once more than the
-    horizon, which spares the copy of every imagined latent that prepending the starts
-    would make.
+    Latents are written to their places as they are reached: to put the starts in front of what
+    a scan emits would copy all of them.
 
     Args:
       world_model: the model that imagines.
@@ -39,16 +39,20 @@ def imagine(
       horizon: H, number of imagined steps.
 
     Returns:
-      `Imagined`: latents `[H + 1, N, ...]`, the first of them `start`, actions
-      `[H + 1, N, A]`; the last one leads nowhere and only completes the shape.
+      `Imagined`: latents `[H + 1, N, ...]`, the first of them `start`, and the actions
+      `[H, N, A]` between them.
     """
 
-    def step(reached, key):
-        carry, latent = reached
+    def step(reached, inputs):
+        (carry, latent, latents), (index, key) = reached, inputs
         key_action, key_latent = jax.random.split(key)
         action = policy(latent).sample(key_action)
-        return world_model.imagine(params, state, key_latent, carry, action), (latent, action)
+        carry, latent = world_model.imagine(params, state, key_latent, carry, action)
+        latents = jax.tree.map(lambda all, x: all.at[index + 1].set(x), latents, latent)
+        return (carry, latent, latents), action
 
-    keys = jax.random.split(key, horizon + 1)
-    _, (latent, action) = jax.lax.scan(step, (carry, start), keys)
-    return jax.lax.stop_gradient(Imagined(latent, action))
+    room = jax.tree.map(lambda x: jnp.zeros((horizon + 1, *x.shape), x.dtype), start)
+    latents = jax.tree.map(lambda all, x: all.at[0].set(x), room, start)
+    steps = jnp.arange(horizon), jax.random.split(key, horizon)
+    (_, _, latents), action = jax.lax.scan(step, (carry, start, latents), steps)
+    return jax.lax.stop_gradient(Imagined(latents, action))

@@ -192,7 +192,7 @@ def _storm_step(model: StormConfig, config: Config) -> int:
 def _storm_cache(model: StormConfig, config: Config) -> int:
     """Numbers in the keys and values of imagination."""
     imagination = config.imagination
-    slots = imagination.context_length + imagination.horizon + 1
+    slots = imagination.context_length + imagination.horizon
     return 4 * model.blocks * imagination.batch_size * slots * model.deter
 
 

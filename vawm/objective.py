@@ -217,8 +217,7 @@ def make_foresight(agent: Agent, config: Config):
 
     def begin(params: PyTree, state: PyTree, inference: Inference, contexts: PyTree, key: Key):
         if imagination.starts == "contexts":
-            # `imagine` takes one step more than it returns.
-            return world_model.follow(params, state, key, contexts, horizon=horizon + 1)[1]
+            return world_model.follow(params, state, key, contexts, horizon=horizon)[1]
         assert world_model.starts is not None
         return world_model.starts(params, state, inference)
 
@@ -276,7 +275,7 @@ def make_foresight(agent: Agent, config: Config):
         reach = losses.discount_weights(discount)[:-1]
         ahead = Foresight(
             latent=jax.tree.map(lambda x: x[:-1], imagined.latent),
-            action=imagined.action[:-1],
+            action=imagined.action,
             value_logits=logits[:-1],
             returns=target,
             slow_target=slow_target_of(slow_critic, imagined.latent, reward, discount),

@@ -124,7 +124,7 @@ class Imagined(NamedTuple):
     """A rollout in imagination: `latent[k + 1]` follows `action[k]` at `latent[k]`."""
 
     latent: Latent  # [H + 1, N, ...]
-    action: Array  # [H + 1, N, action_size], the last one leads nowhere
+    action: Array  # [H, N, action_size]
 
 
 class Predictions(NamedTuple):

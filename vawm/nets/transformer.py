@@ -133,10 +133,19 @@ class Block(nn.Module):
         wide = nn.relu(self.wide(x))
         return self.feedforward_norm(x + self.drop(self.narrow(wide), deterministic))
 
-    def __call__(self, x: Array, visible: Array, deterministic: bool):
+    def __call__(
+        self, x: Array, visible: Array, deterministic: bool, asked: slice = slice(None)
+    ):
+        """What the steps `asked` become, and keys and values of all."""
         query, key, value = self.project(x)
-        mixed = attend(query, key, value, visible, lambda w: self.drop(w, deterministic))
-        return self.add(x, mixed, deterministic), key, value
+        mixed = attend(
+            query[:, asked],
+            key,
+            value,
+            visible[:, asked],
+            lambda w: self.drop(w, deterministic),
+        )
+        return self.add(x[:, asked], mixed, deterministic), key, value
 
 
 class Transformer(nn.Module):
@@ -168,7 +177,11 @@ class Transformer(nn.Module):
         return self.norm(x + position)
 
     def __call__(
-        self, x: Array, visible: Array, deterministic: bool = True
+        self,
+        x: Array,
+        visible: Array,
+        deterministic: bool = True,
+        asked: slice = slice(None),
     ) -> tuple[Array, list[Array], list[Array]]:
         """Reads `[B, L, D]` at positions 0..L-1.
 
@@ -176,9 +189,11 @@ class Transformer(nn.Module):
           x: mixed latents and actions.
           visible: `[B or 1, L, L]`, which step (last axis) each step sees.
           deterministic: without dropout.
+          asked: the steps whose output is wanted; the last block works for no other.
 
         Returns:
-          `[B, L, D]`, and the keys and values of each block, `[B, L, heads, D / heads]`.
+          `[B, steps asked, D]`, and the keys and values of each block,
+          `[B, L, heads, D / heads]`.
 
         Raises:
           ValueError: there are more steps than positions.
@@ -188,7 +203,8 @@ class Transformer(nn.Module):
         x = self.place(x, self.position[: x.shape[1]])
         keys, values = [], []
         for block in self.layers:
-            x, key, value = block(x, visible, deterministic)
+            wanted = asked if block is self.layers[-1] else slice(None)
+            x, key, value = block(x, visible, deterministic, wanted)
             keys.append(key)
             values.append(value)
         return x, keys, values
@@ -278,9 +294,11 @@ class Storm(nn.Module):
         x = nn.relu(self.mix_in_norm(self.mix_in(stoch, action)))
         return self.mix_out_norm(self.mix_out(x))
 
-    def read(self, stoch: Array, action: Array, visible: Array):
+    def read(
+        self, stoch: Array, action: Array, visible: Array, asked: slice = slice(None)
+    ) -> tuple[Array, list[Array], list[Array]]:
         """See `Transformer`; without dropout."""
-        return self.transformer(self.mix(stoch, action), visible)
+        return self.transformer(self.mix(stoch, action), visible, asked=asked)
 
     def read_in_training(self, stoch: Array, action: Array, visible: Array) -> Array:
         """`[B, L, D]` h, with dropout."""

@@ -147,9 +147,11 @@ def storm(
         targets = Targets(taken.obs, arrived.reward, arrived.is_terminal)
         return Explanation(inference, predictions, targets), state
 
-    def read(params: PyTree, stoch: Array, action: Array, visible: Array):
-        """h after every step, and keys and values, without dropout."""
-        return apply(params, nets.Storm.read, flat_stoch(stoch), action, visible)
+    def read(
+        params: PyTree, stoch: Array, action: Array, visible: Array, asked: slice = slice(None)
+    ):
+        """h after the steps `asked`, and keys and values of all, without dropout."""
+        return apply(params, nets.Storm.read, flat_stoch(stoch), action, visible, asked)
 
     def expect(params: PyTree, key: Key, deter: Array) -> Latent:
         """`[N, D]` -> what the prior expects there."""
@@ -163,10 +165,13 @@ def storm(
         steps = batch.trajectory
         _, stoch, _, _ = infer(params, state, key_post, steps.obs, train=False)
         visible = visibility(steps.is_first)
-        deter, keys, values = read(params, stoch, steps.action, visible)
+        # Imagination needs the newest h alone: where nothing else is used, this is computed
+        # without the others, and all that both have in common once.
+        deter, _, _ = read(params, stoch, steps.action, visible)
+        newest, keys, values = read(params, stoch, steps.action, visible, slice(-1, None))
         inferred = Latent(clear(deter[:, :-1], steps.is_first[:, 1:]), stoch[:, 1:])
         ends = steps.is_last[:, -1]  # a new episode is what comes next
-        latent = expect(params, key_prior, clear(deter[:, -1], ends))
+        latent = expect(params, key_prior, clear(newest[:, 0], ends))
         last = jnp.broadcast_to(visible[:, -1], steps.is_first.shape)
         if config.clear_context:
             last = last & ~ends[:, None]
