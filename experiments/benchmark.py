@@ -178,6 +178,18 @@ class TimedUpdate:
         self.seconds.append(time.perf_counter() - begin)
 
 
+def product_gflop_per_s(side: int = 2048, repeats: int = 9) -> float:
+    """What this machine gives to a product of large float32 matrices: a measure of the rest."""
+    matrix = jax.random.normal(jax.random.key(0), (side, side))
+    product = jax.jit(jnp.matmul)
+    seconds = []
+    for _ in range(repeats + 1):
+        begin = time.perf_counter()
+        product(matrix, matrix).block_until_ready()
+        seconds.append(time.perf_counter() - begin)
+    return 2e-9 * side**3 / statistics.median(seconds[1:])
+
+
 def env_steps_per_s(options: Benchmark, config: Config) -> float:
     """Control steps a second of collection: acting, physics and storing, no learning."""
     env = envs.make(options.task, num_envs=options.num_envs, action_repeat=1)
@@ -258,6 +270,7 @@ def run(options: Benchmark) -> dict:
         on.run()
         off.run()
     overheads = percent_more(on.seconds, off.seconds)
+    products = product_gflop_per_s()
     if options.obs == "pixels":
         collected: dict = {"frames_per_s_by_workers": frames_per_s(options, config)}
         collected["fast_rendering"] = options.fast_rendering
@@ -279,6 +292,7 @@ def run(options: Benchmark) -> dict:
         "update_s_median_off": statistics.median(off.seconds),
         "overhead_percent": statistics.median(overheads),
         "overhead_percent_quartiles": quartiles(overheads),
+        "product_gflop_per_s": products,
         "compile_s": on.compile_seconds,
         "peak_rss_gb": peak_rss_gb,
         **collected,
