@@ -51,10 +51,10 @@ def latent():
 @pytest.mark.parametrize("size", [48, 64, 96, 128])
 def test_square_images_of_several_sizes_are_read_and_predicted(size):
     heads, params, state = make(image(size))
-    tokens = heads.encode(params, state, random_obs(image(size)))
+    tokens = jax.jit(heads.encode)(params, state, random_obs(image(size)))
     assert tokens.shape == (*LEADING, heads.token_size)
     assert heads.token_size == (size // 16) ** 2 * 4 * CONFIG.depth
-    predicted = heads.decode(params, state, latent())
+    predicted = jax.jit(heads.decode)(params, state, latent())
     assert predicted.shape == (*LEADING, size, size, 3)
     assert ((predicted > 0) & (predicted < 1)).all()
 
