@@ -10,7 +10,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
-from vawm.envs import TASKS, registration, split
+from vawm.envs import TASKS, registration
 from vawm.errors import InvalidInput
 
 
@@ -36,10 +36,9 @@ assert not {"mujoco", "dm_control", "flax"} & set(sys.modules)
     assert (done.returncode, done.stderr) == (0, "")
 
 
-# Spaces and physics are those of the domain: its other tasks share them.
-@pytest.mark.parametrize("domain", sorted({split(task)[0] for task in TASKS}))
-def test_a_single_environment_passes_the_checker(domain):
-    task = next(task for task in TASKS if split(task)[0] == domain)
+# What Gymnasium sees is made by the same code for every task; one without contacts, one with.
+@pytest.mark.parametrize("task", ["cartpole_swingup", "hopper_hop"])
+def test_a_single_environment_passes_the_checker(task):
     env = gymnasium.make(f"vawm/{task}-v0")
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -1,6 +1,5 @@
 """Training around environments on the host: order, counting, where images are, failures."""
 
-import contextlib
 
 import jax
 import jax.numpy as jnp
@@ -157,8 +156,7 @@ LONG = tiny_pixels.config(env_steps=192)
 @pytest.mark.parametrize(
     ("images", "make", "agent"),
     [
-        ("device", Lamp, lambda config: config),
-        ("host", Picture, lambda config: config),
+        ("device", Picture, lambda config: config),
         ("host", Lamp, tiny_storm.storm),
     ],
 )
@@ -215,8 +213,10 @@ class Broken(Lamp):
 
 
 def test_an_environment_that_fails_ends_the_run_in_one_line(tmp_path):
+    env = tiny_pixels.pool(Broken)
     with pytest.raises(runner.RunError) as error:
-        run(tiny_pixels.CONFIG, tmp_path, tiny_pixels.pool(Broken))
+        run(tiny_pixels.CONFIG, tmp_path, env)
+    assert_closed(env)
     text = str(error.value)
     assert text.startswith("environment 1, episode 7, step ")
     assert "OSError: the lamp is broken" in text
@@ -302,23 +302,22 @@ def test_huge_observations_and_rewards_are_learned_from_and_all_stays_finite(tmp
         assert np.isfinite(leaf).all()
 
 
-def test_environments_are_closed_whatever_happens(tmp_path):
-    for make in (Lamp, Broken):
-        env = tiny_pixels.pool(make)
-        with contextlib.suppress(runner.RunError):
-            run(tiny_pixels.CONFIG, tmp_path / make.__name__, env)
-        with pytest.raises(RuntimeError):
-            env.reset(0)
-    wrong = tiny_pixels.config(num_envs=3)
-    env = tiny_pixels.pool()
-    with pytest.raises(InvalidInput, match="num_envs=3: the environments have 2"):
-        run(wrong, tmp_path / "wrong", env)
+def assert_closed(env):
     with pytest.raises(RuntimeError):
         env.reset(0)
 
 
-def test_a_run_leaves_videos_and_their_numbers(tmp_path):
-    run(tiny_pixels.CONFIG, tmp_path)
+def test_environments_are_closed_where_a_run_is_refused(tmp_path):
+    env = tiny_pixels.pool()
+    with pytest.raises(InvalidInput, match="num_envs=3: the environments have 2"):
+        run(tiny_pixels.config(num_envs=3), tmp_path, env)
+    assert_closed(env)
+
+
+def test_a_run_closes_its_environments_and_leaves_videos_and_their_numbers(tmp_path):
+    env = tiny_pixels.pool()
+    run(tiny_pixels.CONFIG, tmp_path, env)
+    assert_closed(env)
     entries = tracking.read(tmp_path / "videos.jsonl")
     assert [entry["env_steps"] for entry in entries] == [52, 52, 96, 96]  # from 48 on
     loop, episode = entries[:2]
