@@ -1,6 +1,5 @@
 """Training around environments on the host: order, counting, where images are, failures."""
 
-
 import jax
 import jax.numpy as jnp
 import numpy as np

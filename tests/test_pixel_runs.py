@@ -50,7 +50,7 @@ CONFIGS = {
         env=dataclasses.replace(presets.VISION_QUICK.env, fast_rendering=True),
     ),
     "atari100k_storm": tiny_storm.storm(
-        tiny_version(STORM, STEPS // 2, task="kung_fu_master", random_steps=STEPS // 8),
+        tiny_version(STORM, STEPS // 2, task="breakout", random_steps=STEPS // 8),
         world_model=tiny_storm.model(depth=4),
     ),
 }
