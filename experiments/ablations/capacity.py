@@ -14,7 +14,6 @@ is learnt in it.
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import sys
 from collections.abc import Sequence
@@ -72,7 +71,7 @@ IMAGE = ablation.Ablation(
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Trains and writes the table; returns the exit code, 1 if a run failed."""
-    default = Options(**dataclasses.asdict(ablation.defaults(__file__)))
+    default = Options(results=ablation.results_folder(__file__))
     options = flags.read(Options, argv, default=default, description=__doc__)
     chosen = {"model": MODEL, "image": IMAGE}[options.vary]
     return ablation.run(chosen, options, script=__file__)

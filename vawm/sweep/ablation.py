@@ -12,7 +12,7 @@ import dataclasses
 import pathlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 from vawm import config as config_lib
 from vawm import flags, validate
@@ -84,14 +84,21 @@ OFF = ("--value-alignment.weight", "off")
 
 
 @dataclass(frozen=True)
-class Options:
-    """Which runs of an ablation, and where they go."""
+class Compared:
+    """What is compared, and where the results go: the options that all scripts have."""
 
     scale: Literal["quick", "paper"] = "quick"
-    """quick: minutes on a CPU with 2 cores; paper: its tasks and presets, on a GPU"""
+    """quick: for a CPU with 2 cores; paper: its tasks and presets, on a GPU"""
     agent: str = "dreamerv3"
     tasks: tuple[str, ...] = ()
     """as many as are named; those of the scale if none"""
+    results: pathlib.Path = pathlib.Path("experiments/results")
+
+
+@dataclass(frozen=True)
+class Options(Compared):
+    """Which runs of an ablation, and where they go."""
+
     seeds: tuple[int, ...] = ()
     """those of the scale if none"""
     env_steps: int | None = None
@@ -99,7 +106,6 @@ class Options:
     jobs: int = 1
     """runs side by side"""
     runs: pathlib.Path = pathlib.Path("runs/ablations")
-    results: pathlib.Path = pathlib.Path("experiments/results")
     collect_only: bool = False
     """write the results of the runs that are there, and start none"""
 
@@ -108,13 +114,19 @@ def main(
     ablation: Ablation, argv: Sequence[str] | None, *, description: str | None, script: str
 ) -> int:
     """What a script does that compares `ablation`; returns the exit code, 1 if a run failed."""
-    options = flags.read(Options, argv, default=defaults(script), description=description)
+    default = Options(results=results_folder(script))
+    options = flags.read(Options, argv, default=default, description=description)
     return run(ablation, options, script=script)
 
 
-def defaults(script: str) -> Options:
+def results_folder(script: str) -> pathlib.Path:
     """Results go beside the folder of the script, wherever it is started."""
-    return Options(results=pathlib.Path(script).resolve().parents[1] / "results")
+    return programs_folder(script) / "results"
+
+
+def programs_folder(script: str) -> pathlib.Path:
+    """The programs that train are a folder above the script."""
+    return pathlib.Path(script).resolve().parents[1]
 
 
 def run(ablation: Ablation, options: Options, *, script: str) -> int:
@@ -123,13 +135,13 @@ def run(ablation: Ablation, options: Options, *, script: str) -> int:
     Args:
       ablation: what is compared.
       options: which runs, and where they go.
-      script: the file that was started; the programs that train are a folder above it.
+      script: the file that was started.
 
     Raises:
       InvalidInput: before anything is started.
       RunError: matplotlib is missing.
     """
-    sweep = make_sweep(ablation, options, pathlib.Path(script).resolve().parents[1])
+    sweep = make_sweep(ablation, options, programs_folder(script))
     check(ablation, options, sweep)
 
     def report() -> None:
@@ -139,7 +151,7 @@ def run(ablation: Ablation, options: Options, *, script: str) -> int:
     return children.run_then(jobs, report, at_once=options.jobs)
 
 
-def scale_of(ablation: Ablation, options: Options) -> Scale:
+def scale_of(ablation: Ablation, options: Compared) -> Scale:
     return {"quick": ablation.quick, "paper": ablation.paper}[options.scale]
 
 
@@ -169,7 +181,7 @@ def check(ablation: Ablation, options: Options, sweep: Sweep) -> None:
     runs.check_places(jobs=options.jobs, runs=started, results=options.results)
 
 
-def result_name(ablation: Ablation, options: Options) -> str:
+def result_name(ablation: Ablation, options: Compared) -> str:
     """Of files and folders."""
     agent = "" if options.agent == "dreamerv3" else f"_{options.agent}"
     scale = "" if options.scale == "quick" else f"_{options.scale}"
@@ -211,8 +223,8 @@ def setting(agent: str, sweep: Sweep) -> str:
     return f"Agent {agent}, preset {preset} of {sweep.program.name}{length}."
 
 
-def command(options: Any, script: str) -> str:
-    """The command line of a dataclass of options, without what changes no number."""
+def command(options: Compared, script: str) -> str:
+    """The command line that options came from, without what changes no number."""
     words = ["python", "experiments/ablations/" + pathlib.Path(script).name]
     silent = ("jobs", "runs", "results", "collect_only")
     for field in dataclasses.fields(options):

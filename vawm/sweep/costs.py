@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 import pathlib
 import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 from vawm import flags, overhead
 from vawm.analysis.tables import write_csv
 from vawm.envs.protocol import check_positive
 from vawm.overhead import Measured, percent_more, quartiles
 from vawm.sweep import ablation, runs
-from vawm.sweep.ablation import Ablation
+from vawm.sweep.ablation import Ablation, Compared
 from vawm.sweep.results import line
 from vawm.sweep.runs import Run, Sweep
 
@@ -22,30 +23,24 @@ GIB = 2**30
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(Compared):
     """What is measured, and where it goes."""
 
-    scale: Literal["quick", "paper"] = "quick"
-    """quick: minutes on a CPU with 2 cores; paper: its tasks and presets, on a GPU"""
-    agent: str = "dreamerv3"
-    tasks: tuple[str, ...] = ()
-    """as many as are named; those of the scale if none"""
     repeats: int = 20
     """timed samples of each variant"""
-    results: pathlib.Path = pathlib.Path("experiments/results")
 
 
 def main(
     compared: Ablation, argv: Sequence[str] | None, *, description: str | None, script: str
 ) -> int:
     """What a script does that measures two variants: the first, and what it is more than."""
-    default = Options(results=ablation.defaults(script).results)
+    default = Options(results=ablation.results_folder(script))
     options = flags.read(Options, argv, default=default, description=description)
     check_positive("repeats", options.repeats)
-    given = {name: getattr(options, name) for name in ("scale", "agent", "tasks", "results")}
-    same = ablation.Options(**given)
-    sweep = ablation.make_sweep(compared, same, pathlib.Path(script).resolve().parents[1])
-    suite = ablation.scale_of(compared, same).suite
+    given = {field.name: getattr(options, field.name) for field in dataclasses.fields(Compared)}
+    runs_of_it = ablation.Options(**given)  # of which none is started
+    sweep = ablation.make_sweep(compared, runs_of_it, ablation.programs_folder(script))
+    suite = ablation.scale_of(compared, options).suite
     runs.check(sweep, suite)
     runs.check_places(jobs=1, runs=None, results=options.results)
     rows = []
@@ -54,7 +49,7 @@ def main(
         variants = [runs.flags(sweep, run) for run in owned]
         rows += rows_of(owned, overhead.compare(suite, variants, repeats=options.repeats))
     options.results.mkdir(parents=True, exist_ok=True)
-    path = options.results / ablation.result_name(compared, same)
+    path = options.results / ablation.result_name(compared, options)
     notes = f"{compared.title} {ablation.setting(options.agent, sweep)}"
     table = markdown(rows, notes=notes, command=ablation.command(options, script))
     write_csv(rows, path.with_suffix(".csv"))
