@@ -202,6 +202,7 @@ def test_an_ablation_runs_from_end_to_end(tmp_path, capsys):
     assert table in output.out
     assert "Not in the means" not in table
     assert "Made by `python experiments/ablations/noise.py`." in table
+    assert "of each run the mean over the last tenth" in table
     with (tmp_path / "results" / "ablation_noise.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert {row["variant"] for row in rows} == {"independent", "shared"}

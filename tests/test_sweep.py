@@ -165,7 +165,7 @@ def test_seeds_that_are_missing_are_named_and_not_averaged(finished):
     assert (done.seeds, failed.seeds) == ((0, 1), (0,))
     assert done.missing == {2: "has no returns"}
     assert failed.missing == {1: "is at 32 of 96 env steps", 2: "has no returns"}
-    assert done.last == {"return": [3.0, 6.0]}
+    assert done.last == [3.0, 6.0]
     assert done.best == [3.0, 6.0]
     assert done.area == [2.0, 4.0]
     assert failed.area == [2.0]
@@ -177,7 +177,7 @@ def test_a_shorter_sweep_reads_its_own_length_of_runs_that_went_further(finished
     rows = results.read(shorter)
     assert {row["env_steps"] for row in rows} == {32}  # a run ends where it reaches its length
     done, _ = results.summarise(shorter, rows)
-    assert done.last == {"return": [1.0, 2.0]}
+    assert done.last == [1.0, 2.0]
 
 
 def test_the_table_is_the_one_worked_by_hand(finished):
@@ -235,6 +235,13 @@ def test_the_area_of_uneven_steps_is_the_one_worked_by_hand():
     rows = [{"env_steps": s, "return": v} for s, v in [(10, 1.0), (20, 3.0), (40, 5.0)]]
     assert results.area(rows) == pytest.approx((10 * 2 + 20 * 4) / 30)
     assert results.area(rows[:1]) == 1.0
+
+
+def test_other_columns_are_means_over_the_last_tenth_of_a_run():
+    lines = [(80, 100.0), (90, 10.0), (91, 1.0), (95, 2.0), (100, 6.0)]
+    rows = [{"env_steps": steps, "loss": loss} for steps, loss in lines]
+    assert results.late_mean(rows, "loss") == (1.0 + 2.0 + 6.0) / 3
+    assert results.late_mean(rows[:1], "loss") == 100.0
 
 
 def test_curves_are_compared_where_all_of_them_are():

@@ -59,7 +59,8 @@ class Ablation(NamedTuple):
       variants: of an agent; raises `InvalidInput` where it makes no sense for one.
       quick, paper: the two scales.
       factor: what differs between variants: a heading.
-      extra: column -> metric, of what is drawn over time in `ablation_<name>_curves.png`.
+      extra: column -> metric, of what is drawn over time in `ablation_<name>_curves.png`; the
+        table has means over the last tenth of each run.
     """
 
     name: str
@@ -200,7 +201,7 @@ def write(ablation: Ablation, options: Options, sweep: Sweep, made_by: str) -> s
         results.summarise(sweep, rows, columns),
         factor=ablation.factor,
         command=made_by,
-        notes=f"{ablation.title} {setting(options.agent, sweep)}\n\n{HOW_TO_READ}",
+        notes=f"{ablation.title} {setting(options.agent, sweep)}\n\n{how_to_read(ablation)}",
     )
     path.with_suffix(".md").write_text(table)
     figures.plot(rows, sweep, path.with_suffix(".png"), seeds="band")
@@ -214,6 +215,15 @@ HOW_TO_READ = (
     "Returns of the training episodes: mean +- standard error over seeds. The mean return is "
     "the area under the curve, per environment step. Minutes are of one run."
 )
+HOW_TO_READ_EXTRA = (
+    "All other columns: of each run the mean over the last tenth of its environment steps, and "
+    "over seeds as above."
+)
+
+
+def how_to_read(ablation: Ablation) -> str:
+    """What the columns of its table are."""
+    return f"{HOW_TO_READ} {HOW_TO_READ_EXTRA}" if ablation.extra else HOW_TO_READ
 
 
 def setting(agent: str, sweep: Sweep) -> str:

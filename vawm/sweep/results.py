@@ -27,20 +27,22 @@ class Summary(NamedTuple):
       task, variant: which.
       seeds: those that count.
       missing: seed -> why it does not count.
-      last: column -> the last value of each run.
+      last: the last return.
       best: the highest return.
       area: the area under the curve of returns per env step: the mean return.
       minutes: wall time of the run.
+      late: other column -> its mean over the last tenth of the run, of each run that has it.
     """
 
     task: str
     variant: str
     seeds: tuple[int, ...]
     missing: dict[int, str]
-    last: dict[str, list[float]]
+    last: list[float]
     best: list[float]
     area: list[float]
     minutes: list[float]
+    late: dict[str, list[float]]
 
 
 def read(sweep: Sweep, columns: Mapping[str, str] = RETURN) -> Rows:
@@ -90,6 +92,12 @@ def area(rows: Rows) -> float:
     return sum(parts) / width
 
 
+def late_mean(rows: Rows, column: str) -> float:
+    """Mean of a column over the last tenth of a run's env steps; needs one row at least."""
+    end = rows[-1]["env_steps"]
+    return statistics.fmean(row[column] for row in rows if end - row["env_steps"] < end / 10)
+
+
 def missing(sweep: Sweep, rows: Rows, run: Run) -> str | None:
     """Why a run does not count; None where it does."""
     own, length = of_run(rows, run), runs.env_steps(sweep, run)
@@ -109,9 +117,12 @@ def summarise(sweep: Sweep, rows: Rows, columns: Mapping[str, str] = RETURN) -> 
             absent = {seed: missing(sweep, rows, run) for seed, run in chosen.items()}
             counted = [run for seed, run in chosen.items() if absent[seed] is None]
             returns = [of_run(rows, run) for run in counted]
-            last = {
-                name: [own[-1][name] for run in counted if (own := of_run(rows, run, name))]
+            late = {
+                name: [
+                    late_mean(own, name) for run in counted if (own := of_run(rows, run, name))
+                ]
                 for name in columns
+                if name not in RETURN
             }
             summaries.append(
                 Summary(
@@ -119,10 +130,11 @@ def summarise(sweep: Sweep, rows: Rows, columns: Mapping[str, str] = RETURN) -> 
                     variant=variant.name,
                     seeds=tuple(run.seed for run in counted),
                     missing={seed: why for seed, why in absent.items() if why is not None},
-                    last=last,
+                    last=[own[-1]["return"] for own in returns],
                     best=[max(row["return"] for row in own) for own in returns],
                     area=[area(own) for own in returns],
                     minutes=[own[-1]["minutes"] for own in returns],
+                    late=late,
                 )
             )
     return summaries
@@ -149,14 +161,13 @@ def markdown(summaries: Sequence[Summary], *, factor: str, command: str, notes: 
       command: how to make it again.
       notes: a paragraph before the table.
     """
-    others = [name for name in summaries[0].last if name != "return"]
-    names = [name.replace("_", " ") for name in others]
+    names = [name.replace("_", " ") for name in summaries[0].late]
     heads = ["task", factor, "seeds", "last return", "best", "mean return", *names, "minutes"]
     lines = [notes, "", line(heads), line(["---"] * len(heads))]
     for s in summaries:
         total = len(s.seeds) + len(s.missing)
         count = f"{total}" if not s.missing else f"**{len(s.seeds)} of {total}**"
-        measured = [s.last["return"], s.best, s.area, *(s.last[name] for name in others)]
+        measured = [s.last, s.best, s.area, *s.late.values()]
         minutes = f"{statistics.mean(s.minutes):.1f}" if s.minutes else "-"
         cells = [s.task, s.variant, count, *map(mean_and_error, measured), minutes]
         lines.append(line(cells))
