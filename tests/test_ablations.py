@@ -1,6 +1,7 @@
 """The ablations: every run that they would start is one that starts, and one of them is run."""
 
 import csv
+import dataclasses
 import importlib.util
 import pathlib
 import sys
@@ -211,4 +212,9 @@ def test_an_ablation_runs_from_end_to_end(tmp_path, capsys):
     assert last["independent"] != last["shared"]
     for name in ("ablation_noise.png", "ablation_noise_curves.png"):
         assert (tmp_path / "results" / name).stat().st_size
-    assert not runs.unfinished_jobs(ablation.make_sweep(small, options, PROGRAMS))
+    sweep = ablation.make_sweep(small, options, PROGRAMS)
+    assert not runs.unfinished_jobs(sweep)
+    ablation.check(small, options, sweep)
+    longer = dataclasses.replace(options, env_steps=256)
+    with pytest.raises(InvalidInput, match=r"warmup_steps=15: .* was begun with 7; use"):
+        ablation.run(small, longer, script=str(FOLDER / "noise.py"))

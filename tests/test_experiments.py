@@ -7,7 +7,6 @@ import pathlib
 import sys
 
 import pytest
-import tiny
 
 from vawm import command_line, rundir
 
@@ -146,17 +145,19 @@ def test_the_command_of_a_run_says_all_of_it(options):
 
 
 def test_a_run_that_failed_is_named_and_half_a_line_survived(options, monkeypatch, capsys):
-    folder = options.runs / "dmc_proprio" / "cartpole_balance-off-seed0"
+    sweep = curves.make_sweep(options)
+    (run,) = curves.runs.all_runs(sweep)
+    folder = curves.runs.folder(sweep, run)
     folder.mkdir(parents=True)
-    rundir.write_config(folder, tiny.CONFIG)
+    rundir.write_config(folder, curves.runs.parsed(sweep, run, "dmc_proprio"))
     line = {"env_steps": 8, "updates": 1, "time": 60.0, "episode/return": 12.34}
     (folder / "metrics.jsonl").write_text(json.dumps(line) + '\n{"env_st')
 
-    def run(jobs, *, at_once):
+    def fail(jobs, *, at_once):
         assert at_once == 1
         return curves.children.Outcome([(job, 137) for job in jobs], 0)
 
-    monkeypatch.setattr(curves.children, "run", run)
+    monkeypatch.setattr(curves.children, "run", fail)
     assert curves.main(words(options)) == 1
     output = capsys.readouterr()
     assert "last   12.3" in output.out

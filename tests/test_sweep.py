@@ -306,6 +306,46 @@ def test_what_every_run_would_refuse_is_refused_at_once(changes, message, tmp_pa
     assert str(refusal.value).startswith(message)
 
 
+QUICK = {"tasks": ("walker_run",), "variants": (Variant("plain", ()),)}
+
+
+def begin(sweep, run, **changes):
+    """Leaves what a run leaves that was begun in a sweep with these changes."""
+    config = runs.parsed(runs.dataclasses.replace(sweep, **changes), run, "dmc_proprio")
+    runs.folder(sweep, run).mkdir(parents=True)
+    rundir.write_config(runs.folder(sweep, run), config)
+
+
+def test_a_sweep_does_not_mix_the_warm_ups_of_runs_of_two_lengths(tmp_path):
+    sweep = make_sweep(tmp_path, **QUICK, env_steps=80_000)
+    first, second = runs.all_runs(sweep)
+    begin(sweep, first)
+    runs.check(sweep, "dmc_proprio")
+    begin(sweep, second, env_steps=40_000)
+    path = runs.folder(sweep, second)
+    with pytest.raises(InvalidInput) as refusal:
+        runs.check(sweep, "dmc_proprio")
+    assert str(refusal.value) == (
+        f"value_alignment.warmup_steps=4800: {path} was begun with 2400; use another --runs, "
+        "or its --env-steps 40000"
+    )
+
+
+def test_a_sweep_of_the_paper_can_be_made_longer(tmp_path):
+    """Its warm-up does not depend on the length, and nothing else does."""
+    sweep = make_sweep(tmp_path, **QUICK, env_steps=80_000, flags=("--preset", "paper"))
+    for run in runs.all_runs(sweep):
+        begin(sweep, run, env_steps=40_000)
+    runs.check(sweep, "dmc_proprio")
+
+
+def test_runs_of_another_preset_are_not_taken_for_those_of_a_sweep(tmp_path):
+    sweep = make_sweep(tmp_path, **QUICK, flags=("--preset", "paper"))
+    begin(sweep, runs.all_runs(sweep)[0], flags=())
+    with pytest.raises(InvalidInput, match=r"preset='paper': .* was begun with 'quick'; use"):
+        runs.check(sweep, "dmc_proprio")
+
+
 def test_programs_are_there_for_every_suite():
     folder = pathlib.Path(__file__).parents[1] / "experiments"
     assert all((folder / name).exists() for name in runs.PROGRAMS.values())

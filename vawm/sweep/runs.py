@@ -11,7 +11,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from vawm import checkpoint, command_line, rundir, suites, validate
+from vawm import checkpoint, command_line, resume, rundir, suites, validate
 from vawm.analysis import figures as analysis_figures
 from vawm.config import Config
 from vawm.envs.protocol import check_positive
@@ -92,8 +92,8 @@ def flags(sweep: Sweep, run: Run) -> tuple[str, ...]:
 def command(sweep: Sweep, run: Run) -> list[str]:
     """What begins the run, or goes on with it where it was begun."""
     path = folder(sweep, run)
-    resume = [] if rundir.read_config(path) is None else ["--resume"]
-    words = [*flags(sweep, run), "--logdir", str(path), *resume]
+    again = [] if rundir.read_config(path) is None else ["--resume"]
+    words = [*flags(sweep, run), "--logdir", str(path), *again]
     return [sys.executable, str(sweep.program), *words]
 
 
@@ -134,6 +134,32 @@ def check(sweep: Sweep, suite: str) -> None:
             validate.check(dataclasses.replace(config, seed=seed))
         for task in sweep.tasks:
             suites.check_task(dataclasses.replace(config, task=task))
+        for run in all_runs(sweep):
+            if run.variant == variant.name:
+                own = dataclasses.replace(config, task=run.task, seed=run.seed)
+                check_begun(folder(sweep, run), own)
+
+
+def check_begun(path: pathlib.Path, config: Config) -> None:
+    """Refuses a run that was begun with other settings than it would begin with now.
+
+    It keeps its own when it is resumed, so a table would mix them. That happens when a sweep
+    of a small preset is made longer: the warm-up of value alignment follows the length of a
+    run, and those that were begun before have a shorter one than those that were not.
+
+    Raises:
+      InvalidInput: names the first setting that differs.
+    """
+    begun = rundir.read_config(path)
+    if begun is None:
+        return
+    saved = dict(validate.values(begun))
+    for name, value in validate.values(config):
+        if name not in resume.MAY_DIFFER and value != saved.get(name):
+            remedy = f"{path} was begun with {saved.get(name)!r}; use another --runs"
+            if begun.env_steps != config.env_steps:
+                remedy += f", or its --env-steps {begun.env_steps}"
+            raise InvalidInput(name, value, remedy)
 
 
 def parsed(sweep: Sweep, run: Run, suite: str) -> Config:
