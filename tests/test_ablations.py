@@ -40,7 +40,7 @@ def possible(name, scale, agent):
     config = presets.PRESETS[agent].get(chosen.suite, {}).get(chosen.preset)
     if config is None:
         return False
-    if name == "noise" and agent == "vagram":
+    if agent == "vagram" and (name == "noise" or name.startswith("capacity")):
         return False
     return name != "replay_gradient" or config.critic.replay_scale > 0
 
@@ -78,7 +78,21 @@ def test_every_variant_is_one_that_starts(name, scale, agent):
         for variant in sweep.variants
     ]
     assert len(set(configs)) == len(configs) > 1
-    assert {config.agent for config in configs} == {agent}
+    agents = {config.agent for config in configs}
+    beside = name.startswith("capacity") and agent == "dreamerv3"
+    assert agents == ({agent, "vagram"} if beside else {agent})
+
+
+@pytest.mark.parametrize("name", ABLATIONS)
+def test_quick_runs_have_twice_the_updates_in_which_learning_rates_rise(name):
+    options, sweep = make(name, "quick")
+    suite = ablation.scale_of(ABLATIONS[name], options).suite
+    for variant in sweep.variants:
+        config = runs.parsed(sweep, runs.Run(sweep.tasks[0], variant.name, 0), suite)
+        first = command_line.validate.smallest_replay(config)
+        replayed = (config.env_steps // config.action_repeat - first) * config.train_ratio
+        updates = replayed // config.replay.batch_steps
+        assert updates >= 2 * config.optimizer.warmup_updates
 
 
 def compared(name, *fields):
@@ -106,15 +120,20 @@ def test_variants_choose_what_their_names_say():
         "off, replay gradient on": ("off", True),
         "off, replay gradient off": ("off", False),
     }
-    assert compared("capacity_model", weight, "size") == {
-        f"{size} {name}": (name, size)
-        for size in ("1m", "12m", "25m")
-        for name in ("adaptive", "off")
+    methods = {
+        "adaptive": ("dreamerv3", "adaptive"),
+        "off": ("dreamerv3", "off"),
+        "vagram": ("vagram", "off"),
     }
-    assert compared("capacity_image", weight, "env.image_size", "size") == {
-        f"{size} {name}": (name, size, "12m")
+    assert compared("capacity_model", "agent", weight, "size") == {
+        f"{size} {name}": (*method, size)
+        for size in ("1m", "12m", "25m")
+        for name, method in methods.items()
+    }
+    assert compared("capacity_image", "agent", weight, "env.image_size", "size") == {
+        f"{size} {name}": (*method, size, "12m")
         for size in (64, 96, 128)
-        for name in ("adaptive", "off")
+        for name, method in methods.items()
     }
     assert compared("noise", weight, alignment + "noise") == {
         name: ("adaptive", name) for name in ("independent", "shared")
@@ -141,6 +160,7 @@ def test_the_scale_of_the_paper_has_its_games():
         ("noise", ["--jobs", "0"], "jobs=0: use a whole number"),
         ("noise", ["--env-steps", "8"], "env_steps=8: use at least 2048"),
         ("noise", ["--env-steps", "0"], "env_steps=0: use a number above 0"),
+        ("capacity", ["--agent", "vagram"], "agent='vagram': is beside dreamerv3 in its table"),
         ("capacity", ["--vary", "images"], "--vary='images': did you mean 'image'"),
         ("capacity", ["--runs", "/dev/null/a"], "runs='/dev/null/a': is not writable"),
         ("replay_gradient", ["--agent", "storm"], "agent='storm': has no replay value loss"),
@@ -170,6 +190,14 @@ def test_results_are_named_after_scale_and_agent():
     ]
     suffixes = ("", "_storm", "_paper", "_storm_paper")
     assert names == ["ablation_noise" + suffix for suffix in suffixes]
+
+
+def test_the_table_says_whose_runs_are_compared():
+    notes = [ablation.setting("dreamerv3", make(name, "paper")[1]) for name in ABLATIONS]
+    named = [
+        note.startswith("Agent dreamerv3 where none is named, preset paper") for note in notes
+    ]
+    assert named == [name.startswith("capacity") for name in ABLATIONS]
 
 
 def test_the_command_names_all_that_changes_numbers():

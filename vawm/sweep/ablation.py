@@ -56,7 +56,8 @@ class Ablation(NamedTuple):
     Attributes:
       name: of its results.
       title: the first sentence of the table.
-      variants: of an agent; raises `InvalidInput` where it makes no sense for one.
+      variants: of an agent, or with one of their own; raises `InvalidInput` where it makes no
+        sense for one.
       quick, paper: the two scales.
       factor: what differs between variants: a heading.
       extra: column -> metric, of what is drawn over time in `ablation_<name>_curves.png`; the
@@ -227,7 +228,9 @@ def how_to_read(ablation: Ablation) -> str:
 
 
 def setting(agent: str, sweep: Sweep) -> str:
-    """What all runs have in common."""
+    """What all runs have in common, but for an agent that a variant names itself."""
+    if any("--agent" in variant.flags for variant in sweep.variants):
+        agent += " where none is named"
     length = "" if sweep.env_steps is None else f", {sweep.env_steps:,} environment steps"
     preset = sweep.flags[sweep.flags.index("--preset") + 1]
     return f"Agent {agent}, preset {preset} of {sweep.program.name}{length}."
