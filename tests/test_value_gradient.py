@@ -107,7 +107,28 @@ def test_the_other_forms_are_those_of_the_library(form, function):
     np.testing.assert_allclose(actual, expected, rtol=1e-4)
 
 
-def test_a_critic_that_ignores_z_has_no_loss():
+def test_the_joint_form_equals_its_derivatives_by_hand():
+    """V = 2 (w . z)^2 h has the gradient 4 h (w . z) c and H e = 4 h (c . e) c, c centred w."""
+    choices = model(
+        value_gradient_form="joint",
+        value_gradient_unit="raw",
+        value_gradient_critic="online",
+        unimix=0.0,
+    )
+    actual = make_value_gradient_loss(SIMPLE, choices)(jnp.float32(2), (), inference())
+    inferred = jax.tree.map(lambda x: np.asarray(x, np.float64), inference())
+    h = inferred.latent.deter.mean(-1)[..., None]
+    z, guess = (x.stoch.reshape(*SHAPE, 16) for x in (inferred.latent, inferred.prior_latent))
+    centred = WEIGHT.reshape(4, 4) - WEIGHT.reshape(4, 4).mean(-1, keepdims=True)
+    centred, error = centred.reshape(16), guess - z
+    gradient = 4 * h * (z @ WEIGHT)[..., None] * centred
+    product = 4 * h * (error @ centred)[..., None] * centred
+    expected = (2 * (gradient * error) ** 2 + product**2 / 2).sum(-1)
+    np.testing.assert_allclose(actual, expected, rtol=1e-4)
+
+
+@pytest.mark.parametrize("form", ["diagonal", "joint"])
+def test_a_critic_that_ignores_z_has_no_loss(form):
     """Weights that are equal over the classes of a categorical say nothing of its class."""
     ignoring = AGENT._replace(
         critic=SIMPLE.critic._replace(
@@ -116,7 +137,7 @@ def test_a_critic_that_ignores_z_has_no_loss():
             )[..., None]
         )
     )
-    loss = make_value_gradient_loss(ignoring, model())
+    loss = make_value_gradient_loss(ignoring, model(value_gradient_form=form))
     np.testing.assert_allclose(loss(jnp.float32(2), jnp.float32(3), inference()), 0, atol=1e-9)
 
 

@@ -97,8 +97,9 @@ class VagramConfig(RSSMConfig):
     reconstruction_gradient: bool = False
     value_gradient_scale: float = 1.0
     """of VaGraM's loss"""
-    value_gradient_form: Literal["diagonal", "taylor", "second_order"] = "diagonal"
-    """sum_j (dV/dz_j e_j)^2, the official one; (dV/dz . e)^2; or the latter with the Hessian"""
+    value_gradient_form: Literal["diagonal", "taylor", "second_order", "joint"] = "diagonal"
+    """sum_j (dV/dz_j e_j)^2, the official one; (dV/dz . e)^2; or, with the Hessian, the latter
+    or the former"""
     value_gradient_critic: Literal["online", "slow", "both"] = "both"
     """whose gradient; both: the mean of two losses, as the official code has it"""
     value_gradient_unit: Literal["symlog", "raw"] = "symlog"

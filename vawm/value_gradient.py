@@ -15,7 +15,9 @@ FORMS = {
     "diagonal": losses.vagram_loss,
     "taylor": losses.vagram_taylor_loss,
     "second_order": losses.vagram_second_order_loss,
+    "joint": losses.vagram_joint_loss,
 }
+"""Choice of `value_gradient_form` -> loss."""
 
 
 def make_value_gradient_loss(
@@ -25,12 +27,13 @@ def make_value_gradient_loss(
 
         L = scale * sum_j (dV/dz_j)^2 (z~_j - sg z_j)^2,    dV/dz at (h_t, z_t)
 
-    or another of its forms. Each categorical of z sums to 1, which leaves dV/dz open up to a
-    number for all classes of one; it is centred there, so that a critic that ignores z has no
-    loss. z~ are the probabilities of the prior, z of the posterior, after
-    unimix; V is the critic's mean, or its symlog. Gradients reach the world model through z~:
-    the prior, and h_t by way of it. The critics' parameters are stopped, and so is everything
-    that the value is differentiated at.
+    (Voelcker et al., 2022, on latents: our reading), or another form of `vawm.losses.vagram`.
+    Each categorical of z sums to 1, which leaves dV/dz open up to a number for all classes of
+    one; it is centred there, and the Hessian with it, so that a critic that ignores z has no
+    loss. z~ are the probabilities of the prior, z of the posterior, after unimix; V is the
+    critic's mean, or its symlog. Gradients reach the world model through z~: the prior, and
+    h_t by way of it. The critics' parameters are stopped, and so is everything that the value
+    is differentiated at.
     """
     form = FORMS[model.value_gradient_form]
 
