@@ -16,7 +16,7 @@ from vawm import losses, objective
 from vawm.actor_critic import Critic
 from vawm.agent import make_agent
 from vawm.transforms import TwoHot
-from vawm.types import Inference, Latent
+from vawm.types import Inference, Latent, image
 from vawm.value_gradient import make_value_gradient_loss
 
 CONFIG, SPEC = tiny_vagram.CONFIG, tiny.env().spec
@@ -170,6 +170,35 @@ def test_vagram_alone_trains_the_prior_and_reaches_h():
     assert norm(moved["rssm"]["gru"]) > 0
     for head in ("decoder", "reward", "cont"):
         assert norm(moved[head]) == 0.0
+
+
+def test_from_pixels_it_alone_trains_the_prior_and_every_layer_of_the_encoder():
+    choices, pixels = model(depth=1), SPEC._replace(obs=image(48))
+    config = dataclasses.replace(CONFIG, world_model=choices)
+    agent = make_agent(config, pixels)
+    vagram = make_value_gradient_loss(agent, choices)
+    seen = np.random.default_rng(0).integers(0, 256, (2, 9, 48, 48, 3), np.uint8)
+    data = batch(agent)
+    data = data._replace(trajectory=data.trajectory._replace(obs=jnp.asarray(seen)))
+
+    @jax.jit
+    def gradient(key):
+        params, state = agent.init(key)
+        params = noisy(params)
+
+        def loss(world_model):
+            explained, _ = agent.world_model.explain(
+                world_model, state, jax.random.key(1), data
+            )
+            return vagram(params.critic, params.critic, explained.inference).mean()
+
+        return jax.grad(loss)(params.world_model)
+
+    own = gradient(jax.random.key(0))
+    for leaf in jax.tree.leaves([own["encoder"], own["rssm"]["prior_net"]]):
+        assert 0 < jnp.abs(leaf).max() < np.inf
+    for head in ("decoder", "reward", "cont"):
+        assert norm(own[head]) == 0.0
 
 
 @pytest.mark.parametrize("form", ["taylor", "second_order"])
