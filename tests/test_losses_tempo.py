@@ -1,5 +1,7 @@
 """TEMPO's meta gradient: by hand, against its closed form, and against finite differences."""
 
+import doctest
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -99,6 +101,29 @@ def test_gradient_by_hand():
     np.testing.assert_allclose(value, 1.75**2 / 2)
     # -1/2 * (theta' - 2) * (-1, 1): more weight on the sample that pulls towards 2.
     np.testing.assert_allclose(gradient, [-0.875, 0.875])
+
+
+def test_the_example_of_the_docstring_runs():
+    names = {}
+    (example,) = doctest.DocTestFinder(recurse=False).find(
+        losses.tempo_meta_gradient, "tempo", globs=names
+    )
+    outcome = doctest.DocTestRunner().run(example, clear_globs=False)
+    assert outcome.failed == 0 < outcome.attempted
+    names = example.globs
+    # By then the third sample, which has pulled away from the task, weighs least.
+    assert names["weights"](names["phi"]).argmin() == 2
+    assert names["theta"] > 1.0 - 0.1 * 8 / 3  # where equal weights lead
+
+
+def test_the_example_of_the_docstring_by_hand():
+    x, y = np.array([1.0, 2.0, 3.0]), np.array([2.0, 4.0, 0.0])
+    pull = 2 * x * (x - y)  # at theta = 1: (-2, -8, 18)
+    theta = 1 - 0.1 * pull.mean()
+    np.testing.assert_allclose((theta - 2) ** 2, 1.6044, atol=5e-5)
+    to_weights = -0.1 * 2 * (theta - 2) * pull
+    to_scores = (to_weights - to_weights.mean()) / 3  # through a softmax of equal scores
+    np.testing.assert_allclose([to_scores @ x, to_scores @ y], [1.6889, -4.3911], atol=5e-5)
 
 
 def test_a_step_of_no_size_has_no_gradient():

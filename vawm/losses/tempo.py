@@ -49,8 +49,38 @@ def tempo_meta_gradient(
       step_size: of the unrolled step.
 
     Returns:
-      `[]` L_task(theta') and its gradient, a tree like `weight_params`. Nothing but phi is
-      differentiated, so a critic in `task_loss` is left as it is, stopped or not.
+      `[]` L_task(theta') in its own units, and its gradient, a tree like `weight_params`.
+      Nothing but phi is differentiated, so a critic in `task_loss` is left as it is, stopped or
+      not.
+
+    Raises:
+      AssertionError: losses and weights have different shapes, or L_task is not a scalar.
+
+    Examples:
+      A line through 0 and three samples, of which the last leads away from the slope 2 of the
+      task. The network of the weights has one layer; it reads the samples.
+
+      >>> import jax, jax.numpy as jnp
+      >>> from vawm import losses
+      >>> x, y = jnp.array([1.0, 2.0, 3.0]), jnp.array([2.0, 4.0, 0.0])
+      >>> def sample_losses(theta):
+      ...     return jnp.square(theta * x - y)
+      >>> def weights(phi):
+      ...     return jax.nn.softmax(x * phi["x"] + y * phi["y"])
+      >>> def task_loss(theta):
+      ...     return jnp.square(theta - 2.0)
+      >>> theta, phi = jnp.array(1.0), {"x": jnp.array(0.0), "y": jnp.array(0.0)}
+      >>> loss, gradient = losses.tempo_meta_gradient(
+      ...     sample_losses, weights, task_loss, theta, phi, step_size=0.1
+      ... )
+      >>> print(f"{loss:.4f} {gradient['x']:.4f} {gradient['y']:.4f}")
+      1.6044 1.6889 -4.3911
+
+      Then both learn, the weights first: less of large x, more of large y.
+
+      >>> phi = jax.tree.map(lambda p, g: p - 0.1 * g, phi, gradient)
+      >>> step = jax.grad(lambda theta: (weights(phi) * sample_losses(theta)).sum())(theta)
+      >>> theta = theta - 0.1 * step
     """
 
     def weighted_loss(params: PyTree, weight_params: PyTree) -> Array:
