@@ -36,7 +36,10 @@ def lambda_returns(
       lambda_: mixing weight; 0 is one-step TD, 1 is Monte Carlo.
 
     Returns:
-      `[H, ...]` returns R_0..R_{H-1}. Gradients are not stopped here.
+      `[H, ...]` returns R_0..R_{H-1}, in environment units. Gradients are not stopped here.
+
+    Raises:
+      AssertionError: the shapes differ.
     """
     chex.assert_equal_shape([reward, discount, value])
     last = value[-1] if bootstrap is None else bootstrap
@@ -59,7 +62,7 @@ def replay_returns(
     discount: float,
     lambda_: float,
 ) -> Array:
-    """Lambda-returns along replayed experience, for the replay value loss.
+    """Lambda-returns along replayed experience, for the replay value loss: Eq. 7 in replay.
 
         R_t = r_{t+1} + gamma * (1 - term_{t+1})
               * ((1 - lambda_{t+1}) * b_{t+1} + lambda_{t+1} * R_{t+1})
@@ -77,8 +80,11 @@ def replay_returns(
       lambda_: mixing weight inside an episode.
 
     Returns:
-      `[B, T - 1]` returns R_0..R_{T-2}. Gradients are not stopped here. The caller masks t
-      where `is_last`: what follows it is another episode.
+      `[B, T - 1]` returns R_0..R_{T-2}, in environment units. Gradients are not stopped here.
+      The caller masks t where `is_last`: what follows it is another episode.
+
+    Raises:
+      AssertionError: the shapes are not `[B, T]`, all the same.
     """
     chex.assert_rank(reward, 2)
     chex.assert_equal_shape([reward, is_last, is_terminal, bootstrap])
@@ -99,14 +105,19 @@ def replay_returns(
 
 
 class ReturnScale(NamedTuple):
-    """Moving averages of a low and a high percentile of returns, in environment units."""
+    """Moving averages of two percentiles of returns, Eq. 9, in environment units."""
 
     low: Array  # [] float32
     high: Array  # [] float32
 
 
 def init_return_scale() -> ReturnScale:
-    """Both percentiles at 0; they are not debiased, as in the official DreamerV3."""
+    """The averages of Eq. 9 before the first update.
+
+    Returns:
+      `ReturnScale` of both percentiles at 0, `[]` each; they are not debiased, as in the
+      official DreamerV3.
+    """
     return ReturnScale(low=jnp.zeros(()), high=jnp.zeros(()))
 
 
@@ -115,12 +126,17 @@ def update_return_scale(
 ) -> ReturnScale:
     """Move towards the percentiles of a batch of returns, Eq. 9. Update before use.
 
+        Per <- decay * Per + (1 - decay) * quantile(R),  for both fractions
+
     Args:
       state: the averages so far.
-      returns: `[...]` all returns of the batch, pooled. Gradients are stopped.
+      returns: `[...]` all returns of the batch, pooled, in environment units.
       decay: share of the old average that stays.
       low: lower fraction, such as 0.05.
       high: upper fraction, such as 0.95.
+
+    Returns:
+      `ReturnScale` of `[]` averages, in environment units. The returns are stopped.
     """
     now = jnp.quantile(jax.lax.stop_gradient(returns), jnp.array([low, high]))
     return ReturnScale(
@@ -130,5 +146,15 @@ def update_return_scale(
 
 
 def return_scale(state: ReturnScale, *, limit: float) -> Array:
-    """S = max(limit, high - low), Eq. 9: divides advantages, never enlarges them at limit 1."""
+    """What divides advantages, Eq. 9; at limit 1 it never enlarges them.
+
+        S = max(limit, high - low)
+
+    Args:
+      state: the averages, after their update.
+      limit: the least S, in environment units.
+
+    Returns:
+      `[]` S, in environment units. Nothing is stopped here: updates are.
+    """
     return jnp.maximum(limit, state.high - state.low)

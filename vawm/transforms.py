@@ -18,15 +18,32 @@ Array = jax.Array
 
 
 def symlog(x: Array) -> Array:
-    """sign(x) * log(1 + |x|): compresses magnitude, keeps sign and the slope around 0.
+    """Compresses magnitude, keeps sign and the slope around 0 (DreamerV3; Hafner et al., 2025).
+
+        symlog(x) = sign(x) * log(1 + |x|)
 
     At exactly 0 JAX gives the gradient 0 instead of 1, as of the absolute value.
+
+    Args:
+      x: `[...]` in raw units.
+
+    Returns:
+      `[...]` in symlog units. Nothing is stopped.
     """
     return jnp.sign(x) * jnp.log1p(jnp.abs(x))
 
 
 def symexp(x: Array) -> Array:
-    """sign(x) * (exp(|x|) - 1), the inverse of `symlog`."""
+    """The inverse of `symlog` (DreamerV3; Hafner et al., 2025).
+
+        symexp(x) = sign(x) * (exp(|x|) - 1)
+
+    Args:
+      x: `[...]` in symlog units.
+
+    Returns:
+      `[...]` in raw units. Nothing is stopped. As of `symlog`, the gradient at 0 is 0.
+    """
     return jnp.sign(x) * jnp.expm1(jnp.abs(x))
 
 
@@ -35,6 +52,9 @@ def symexp_bins(n: int) -> Array:
 
     The upper half is the negated lower half, bit for bit. Odd `n` has 0 in the middle; even
     `n` has it twice, as in the official DreamerV3.
+
+    Raises:
+      ValueError: fewer than two bins.
     """
     if n < 2:
         raise ValueError(f"symexp_bins needs at least 2 bins, got n={n}")
@@ -64,6 +84,17 @@ def make_two_hot(n: int, spacing: Literal["symexp", "symlog"]) -> TwoHot:
     "symexp", as in DreamerV3: bins are numbers, spaced by symexp, and a mean is one of numbers.
     "symlog", as in STORM: bins are symlogs, evenly spaced, and a mean is one of symlogs, which
     is decoded then: where classes disagree, that is nearer to 0.
+
+    Args:
+      n: number of bins; odd for a code with a bin at 0.
+      spacing: of the bins.
+
+    Returns:
+      `TwoHot` of `[n]` bins, in raw units or in symlogs, and two functions of any leading dims.
+      `mean` has a gradient by its logits; nothing is stopped in `encode` either.
+
+    Raises:
+      ValueError: fewer than two bins spaced by symexp.
     """
     if spacing == "symexp":
         bins = symexp_bins(n)
@@ -112,9 +143,23 @@ def two_hot_mean(logits: Array, bins: Array) -> Array:
 
 
 def two_hot_cross_entropy(logits: Array, target: Array, bins: Array) -> Array:
-    """`[...]` cross-entropy of softmax(logits) to the two-hot code of `target`.
+    """Cross-entropy of softmax(logits) to the two-hot code of a number, as in Eq. 7.
 
-    See `two_hot_cross_entropies`, of which this is the case of a single target.
+        CE = logsumexp(logits) - (1 - w) * logits[below] - w * logits[above]
+
+    w is what the target is on its way from the bin below to the bin above. This is
+    `two_hot_cross_entropies` for a single target.
+
+    Args:
+      logits: `[..., n]`.
+      target: `[...]` in the units of `bins`; beyond the ends it is clipped.
+      bins: `[n]` increasing, such as `TwoHot.bins`.
+
+    Returns:
+      `[...]` losses in nats. Gradients reach the logits only; the target is stopped.
+
+    Raises:
+      AssertionError: the shapes do not fit each other.
     """
     (loss,) = two_hot_cross_entropies(logits, (target,), bins)
     return loss
@@ -136,7 +181,10 @@ def two_hot_cross_entropies(
       bins: `[n]` increasing.
 
     Returns:
-      One `[...]` loss per target. Gradients reach the logits only; targets are stopped.
+      One `[...]` loss in nats per target. Gradients reach the logits only; targets are stopped.
+
+    Raises:
+      AssertionError: the shapes do not fit each other.
     """
     chex.assert_equal(logits.shape[-1:], bins.shape)
     logits = logits.astype(jnp.float32)
@@ -159,7 +207,20 @@ def unimix_logits(logits: Array, unimix: float) -> Array:
 
 
 def categorical_kl(p_logits: Array, q_logits: Array) -> Array:
-    """KL[softmax(p) || softmax(q)] over the last axis; exactly 0 for equal logits."""
+    """The divergence in Eq. 3b, 4 and 5: KL[softmax(p) || softmax(q)] over the last axis.
+
+        KL = sum_k p_k (log p_k - log q_k)
+
+    Args:
+      p_logits: `[..., K]`, normalised or not.
+      q_logits: `[..., K]`, normalised or not.
+
+    Returns:
+      `[...]` in nats, in float32; exactly 0 for equal logits. Nothing is stopped.
+
+    Raises:
+      AssertionError: the shapes differ.
+    """
     chex.assert_equal_shape([p_logits, q_logits])
     log_p = jax.nn.log_softmax(p_logits.astype(jnp.float32))
     log_q = jax.nn.log_softmax(q_logits.astype(jnp.float32))

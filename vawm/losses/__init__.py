@@ -18,7 +18,7 @@ What they are made of, from `vawm.returns` and `vawm.transforms`:
                                                               Eq. 9   units of the advantage
     make_two_hot, two_hot_cross_entropy, categorical_kl, symlog, symexp
 
-The value-aware family, from the publications that their docstrings name:
+The value-aware family:
 
     vaml_loss                               VAML      the critic that is furthest off
     iter_vaml_loss                          IterVAML  squared error of the mean value
@@ -34,6 +34,24 @@ The value-aware family, from the publications that their docstrings name:
 
 The critic is the caller's to stop, except for `muzero_value_loss`, which trains it, and
 `tempo_meta_gradient`, which differentiates by the weights alone.
+
+What docstrings cite. Equation numbers without a name are those of the paper that this package
+is about; where one of these has no number, the equation is as we know it, not as printed there.
+
+    Farahmand et al., 2017      Value-Aware Loss Function for Model-based Reinforcement Learning
+    Farahmand, 2018             Iterative Value-Aware Model Learning
+    Schrittwieser et al., 2020  Mastering Atari, Go, chess and shogi by planning with a learned
+                                model
+    Voelcker et al., 2022       Value Gradient weighted Model-Based Reinforcement Learning
+    Voelcker et al., 2023       lambda-models: Effective Decision-Aware Reinforcement Learning
+                                with Latent Models, arXiv 2306.17366
+    Yuan et al., 2023           Task-aware world model learning with meta weighting via bi-level
+                                optimization
+    Hafner et al., 2025         Mastering diverse control tasks through world models
+    Voelcker et al., 2025a      MAD-TD: Model-Augmented Data stabilizes High Update Ratio RL,
+                                arXiv 2410.08896
+    Voelcker et al., 2025b      Calibrated Value-Aware Model Learning with Probabilistic
+                                Environment Models, arXiv 2505.22772
 """
 
 from vawm.losses.behaviour import actor_loss, critic_loss, discount_weights

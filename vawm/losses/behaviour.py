@@ -35,6 +35,9 @@ def critic_loss(
 
     Returns:
       `[...]` losses in nats. Both targets are stopped.
+
+    Raises:
+      AssertionError: the shapes do not fit each other, or the logits the bins.
     """
     to_returns, to_slow = two_hot_cross_entropies(value_logits, (returns, slow_target), bins)
     return to_returns + slow_scale * to_slow
@@ -48,21 +51,28 @@ def actor_loss(
         L = -(sg(A) * log pi(a | s) + entropy_scale * H[pi(. | s)])
 
     Args:
-      log_prob: `[...]` of the imagined action, summed over action dims.
-      entropy: `[...]` of the policy at the same state, summed over action dims.
-      advantage: `[...]` (R_t - v_t) / S. Its gradient is stopped.
+      log_prob: `[...]` of the imagined action in nats, summed over action dims.
+      entropy: `[...]` of the policy at the same state in nats, summed over action dims.
+      advantage: `[...]` A = (R_t - v_t) / S, without unit: S is the scale of Eq. 9.
       entropy_scale: weight of the bonus.
 
     Returns:
-      `[...]` losses.
+      `[...]` losses. The advantage is stopped; the action is the caller's to stop, or a
+      reparametrised one sends gradients through log_prob.
+
+    Raises:
+      AssertionError: the shapes differ.
     """
     chex.assert_equal_shape([log_prob, entropy, advantage])
     return -(jax.lax.stop_gradient(advantage) * log_prob + entropy_scale * entropy)
 
 
 def discount_weights(cont: Array) -> Array:
-    """Probability that each imagined state is reached, discounted: w_t = prod_{i<=t} c_i.
+    """Probability that each imagined state is reached, discounted.
 
+        w_t = prod_{i<=t} c_i
+
+    Weights of the losses of Eq. 7 and 8 in the official DreamerV3; the equations have none.
     c_0, predicted at the replayed start, is included: a rollout from a terminal state weighs
     nothing.
 

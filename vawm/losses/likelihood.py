@@ -15,7 +15,13 @@ PyTree = Any
 
 
 class PredictionLoss(NamedTuple):
-    """The parts of Eq. 3a, each `[...]`; the caller scales and averages them."""
+    """The parts of Eq. 3a, each `[...]`; the caller scales and averages them.
+
+    Attributes:
+      reconstruction: squared error, in symlog units or of pixels in [0, 1], summed.
+      reward: cross-entropy in nats.
+      cont: cross-entropy in nats.
+    """
 
     reconstruction: Array
     reward: Array
@@ -35,6 +41,9 @@ def prediction_loss(
 ) -> PredictionLoss:
     """How badly the heads predict what arrived with o_t, Eq. 3a.
 
+        reconstruction = |o^ - symlog(o)|^2,  of images |o^ - o / 255|^2
+        reward = CE(r^, twohot(r)),  cont = CE(c^, discount * (1 - terminal))
+
     All at the same index: the reward r_t and the flag arrive with o_t and are read from s_t.
     The paper's text has squared error for the reward; its table and every public code have
     the two-hot cross-entropy used here.
@@ -50,6 +59,13 @@ def prediction_loss(
       bins: `[bins]` of the reward head: of rewards, or of their symlogs.
       discount: gamma, which the continue head learns along with the end of episodes; 1 where it
         learns that alone.
+
+    Returns:
+      `PredictionLoss` of `[...]` losses. Gradients reach the predictions; the reward is
+      stopped, and the other targets are data.
+
+    Raises:
+      AssertionError: predictions and targets have different shapes.
     """
     chex.assert_equal_shape([cont_logit, reward, is_terminal])
     parts = jax.tree.map(reconstruction_loss, obs_prediction, obs)
@@ -62,26 +78,82 @@ def prediction_loss(
 
 
 def reconstruction_loss(prediction: Array, target: Array) -> Array:
-    """`[...]` of one array: `image_mse` of bytes, `symlog_mse` of floats."""
+    """Reconstruction of Eq. 3a for one array: `image_mse` of bytes, `symlog_mse` of floats.
+
+    Args:
+      prediction: `[..., D]` in symlog units, or `[..., H, W, C]` in [0, 1].
+      target: `[..., D]` floats, or `[..., H, W, C]` uint8.
+
+    Returns:
+      `[...]` losses.
+
+    Raises:
+      AssertionError: the shapes differ.
+    """
     is_image = jnp.issubdtype(target.dtype, jnp.integer)
     return image_mse(prediction, target) if is_image else symlog_mse(prediction, target)
 
 
 def symlog_mse(prediction: Array, target: Array) -> Array:
-    """`[...]` squared error to symlog(target), summed over the last axis."""
+    """Squared error in symlog units, summed: reconstruction of vectors, Eq. 3a.
+
+        L = sum_j (o^_j - symlog(o_j))^2
+
+    Args:
+      prediction: `[..., D]` in symlog units.
+      target: `[..., D]` in raw units.
+
+    Returns:
+      `[...]` losses, in squared symlog units. Nothing is stopped: the target is data.
+
+    Raises:
+      AssertionError: the shapes differ.
+    """
     chex.assert_equal_shape([prediction, target])
     return jnp.square(prediction.astype(jnp.float32) - symlog(target)).sum(-1)
 
 
 def image_mse(prediction: Array, target: Array) -> Array:
-    """`[...]` squared error of `[..., H, W, C]` in [0, 1] to bytes / 255, summed."""
+    """Squared error of pixels in [0, 1], summed: reconstruction of images.
+
+        L = sum (o^ - o / 255)^2
+
+    Both official codes have it so; in the paper's text Eq. 3a has symlogs of images too.
+
+    Args:
+      prediction: `[..., H, W, C]` in [0, 1].
+      target: `[..., H, W, C]` bytes from 0 to 255.
+
+    Returns:
+      `[...]` losses, in squared units of a pixel in [0, 1]. Nothing is stopped: the target is
+      data.
+
+    Raises:
+      AssertionError: the shapes differ.
+    """
     chex.assert_equal_shape([prediction, target])
     scaled = target.astype(jnp.float32) / 255.0
     return jnp.square(prediction.astype(jnp.float32) - scaled).sum((-3, -2, -1))
 
 
 def continue_loss(logit: Array, target: Array) -> Array:
-    """`[...]` binary cross-entropy to a probability `target`, usually gamma or 0."""
+    """Logistic regression of whether the episode goes on, Eq. 3a.
+
+        L = -(c log p + (1 - c) log(1 - p)),  p = sigmoid(logit)
+
+    c may be any probability: in the official DreamerV3 it is gamma, and 0 where terminal; in
+    the official STORM 1 and 0.
+
+    Args:
+      logit: `[...]`.
+      target: `[...]` c, in [0, 1].
+
+    Returns:
+      `[...]` losses in nats. Nothing is stopped: the target is data.
+
+    Raises:
+      AssertionError: the shapes differ.
+    """
     chex.assert_equal_shape([logit, target])
     logit = logit.astype(jnp.float32)
     return jax.nn.softplus(logit) - target * logit
@@ -113,7 +185,11 @@ def dynamics_loss(
       representation_scale: weight of the term that moves the posterior.
 
     Returns:
-      `[...]` losses, and `[...]` the raw KL in nats, summed over the categoricals.
+      `[...]` losses in nats, and `[...]` the raw KL in nats, summed over the categoricals and
+      stopped.
+
+    Raises:
+      AssertionError: the shapes differ.
     """
     dynamics, representation = balanced_kl(post_logits, prior_logits, unimix=unimix)
     loss = dynamics_scale * jnp.maximum(free_nats, dynamics)
@@ -135,10 +211,23 @@ def batch_dynamics_loss(
         L = dynamics_scale * max(free, mean KL[sg q || p])
             + representation_scale * max(free, mean KL[q || sg p])
 
-    Below the free nats no state has a gradient, however far its own prior is off.
+    Below the free nats no state has a gradient, however far its own prior is off. Means are
+    over all leading dims; the rest is Eq. 3b.
+
+    Args:
+      post_logits: `[..., S, K]` of q(z|h,o), before unimix.
+      prior_logits: `[..., S, K]` of p(z|h), before unimix.
+      unimix: uniform share mixed into both.
+      free_nats: floor of each term's mean, after summing over the S categoricals.
+      dynamics_scale: weight of the term that moves the prior.
+      representation_scale: weight of the term that moves the posterior.
 
     Returns:
-      `[]` the loss, and `[...]` the raw KL in nats.
+      `[]` the loss in nats, and `[...]` the raw KL in nats, summed over the categoricals and
+      stopped.
+
+    Raises:
+      AssertionError: the shapes differ.
     """
     dynamics, representation = balanced_kl(post_logits, prior_logits, unimix=unimix)
     loss = dynamics_scale * jnp.maximum(free_nats, dynamics.mean())
@@ -149,7 +238,21 @@ def batch_dynamics_loss(
 def balanced_kl(
     post_logits: Array, prior_logits: Array, *, unimix: float
 ) -> tuple[Array, Array]:
-    """`[...]` KL[sg q || p] and KL[q || sg p], summed over the categoricals: equal numbers."""
+    """Both terms of Eq. 3b without scales and free nats: equal numbers, other gradients.
+
+        KL[sg q || p]  and  KL[q || sg p],  summed over the categoricals
+
+    Args:
+      post_logits: `[..., S, K]` of q(z|h,o), before unimix.
+      prior_logits: `[..., S, K]` of p(z|h), before unimix.
+      unimix: uniform share mixed into both.
+
+    Returns:
+      `[...]` and `[...]`, both in nats: the first moves the prior, the second the posterior.
+
+    Raises:
+      AssertionError: the shapes differ.
+    """
     chex.assert_equal_shape([post_logits, prior_logits])
     stop = jax.lax.stop_gradient
     post, prior = unimix_logits(post_logits, unimix), unimix_logits(prior_logits, unimix)

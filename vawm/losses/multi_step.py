@@ -26,22 +26,25 @@ def lambda_ac_loss(prediction_values: Array, target_values: Array, mask: Array) 
     Returns:
       `[...]` losses, in squared units of the values. Targets and mask are stopped; the caller
       stops the critic's parameters.
+
+    Raises:
+      AssertionError: the shapes differ.
     """
     chex.assert_equal_shape([prediction_values, target_values, mask])
     return _masked_squares(prediction_values, target_values, mask).sum(0)
 
 
 def muzero_value_loss(values: Array, returns: Array, mask: Array) -> Array:
-    """Value loss along an unrolled model (Schrittwieser et al., 2020), with squared errors.
+    """Value loss of MuZero (Schrittwieser et al., 2020, in Eq. 1), with squared errors.
 
         L = mask_0 (v_0 - sg y_0)^2 + 1/K sum_{k=1..K} mask_k (v_k - sg y_k)^2
 
-    v_0 is the value of the encoded state and v_k that after k steps of the model; y_k is
-    bootstrapped from experience, by `n_step_returns`. The weights 1/K are the original's
-    scaling of gradients by 1/K at each head. It also halves gradients where the dynamics
-    take their state in: `scale_gradient(latent, scale=0.5)` before each step. Its reward and
-    policy losses are not here; for a categorical critic it has a cross-entropy instead,
-    `vawm.transforms.two_hot_cross_entropy` to the same returns.
+    v_0 is the value of the encoded state and v_k that after the model was unrolled for k
+    steps; y_k is bootstrapped from experience, by `n_step_returns`. The weights 1/K are the
+    original's scaling of gradients by 1/K at each head. It also halves gradients where the
+    dynamics take their state in: `scale_gradient(latent, scale=0.5)` before each step. Its
+    reward and policy losses are not here; for a categorical critic it has a cross-entropy
+    instead, `vawm.transforms.two_hot_cross_entropy` to the same returns.
 
     The critic is NOT frozen: this one loss trains model and critic. Where the environment
     is stochastic its minimum is not at the true model. The original trains on absorbing states
@@ -54,6 +57,9 @@ def muzero_value_loss(values: Array, returns: Array, mask: Array) -> Array:
 
     Returns:
       `[...]` losses, in squared units of the values. Returns and mask are stopped.
+
+    Raises:
+      AssertionError: the shapes differ.
     """
     chex.assert_equal_shape([values, returns, mask])
     errors = _masked_squares(values, returns, mask)
@@ -61,7 +67,7 @@ def muzero_value_loss(values: Array, returns: Array, mask: Array) -> Array:
 
 
 def n_step_returns(reward: Array, discount: Array, value: Array, *, steps: int) -> Array:
-    """Returns of n steps of experience, bootstrapped with a value.
+    """Returns of n steps of experience, bootstrapped with a value (Schrittwieser et al., 2020).
 
         y_t = r_{t+1} + d_{t+1} (r_{t+2} + ... + d_{t+n-1} (r_{t+n} + d_{t+n} v_{t+n}))
 
@@ -69,17 +75,19 @@ def n_step_returns(reward: Array, discount: Array, value: Array, *, steps: int) 
     s_{k+1}.
 
     Args:
-      reward: `[T, ...]` r_1..r_T.
+      reward: `[T, ...]` r_1..r_T, in units of the environment or of the caller's choice.
       discount: `[T, ...]` gamma at s_1..s_T, 0 where terminal. A window has to lie within one
         episode up to a terminal state: past a time limit, rewards of the next one would count.
       value: `[T, ...]` v_1..v_T, in the units of the reward.
       steps: n, from 1 to T.
 
     Returns:
-      `[T - n + 1, ...]` y_0..y_{T-n}. Gradients are not stopped here.
+      `[T - n + 1, ...]` y_0..y_{T-n}, in the units of the reward. Gradients are not stopped
+      here.
 
     Raises:
       ValueError: `steps` outside 1..T.
+      AssertionError: the shapes differ.
     """
     chex.assert_equal_shape([reward, discount, value])
     if not 1 <= steps <= len(reward):
@@ -92,7 +100,17 @@ def n_step_returns(reward: Array, discount: Array, value: Array, *, steps: int) 
 
 
 def scale_gradient(x: Array, *, scale: float) -> Array:
-    """`[...]` exactly x, whose gradient is multiplied by `scale`."""
+    """The same numbers with a scaled gradient (Schrittwieser et al., 2020).
+
+        y = sg x + scale * (x - sg x)
+
+    Args:
+      x: `[...]` of any unit.
+      scale: by which the gradient is multiplied: 1/2 in MuZero, before each step of the model.
+
+    Returns:
+      `[...]` exactly x.
+    """
     stopped = jax.lax.stop_gradient(x)
     return stopped + scale * (x - stopped)
 
@@ -110,7 +128,10 @@ def latent_consistency_loss(prediction: Array, target: Array) -> Array:
       target: `[..., D]` latents of the (slow) encoder at the same steps.
 
     Returns:
-      `[...]` losses. The target is stopped.
+      `[...]` losses, in squared units of the latents. The target is stopped.
+
+    Raises:
+      AssertionError: the shapes differ.
     """
     chex.assert_equal_shape([prediction, target])
     return jnp.square(prediction - jax.lax.stop_gradient(target)).sum(-1)

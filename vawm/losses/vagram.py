@@ -13,7 +13,7 @@ Value = Callable[[Array], Array]
 
 
 def vagram_loss(value: Value, prediction: Array, target: Array) -> Array:
-    """Value-gradient-weighted squared error (Voelcker et al., 2022), diagonal form.
+    """Value-gradient-weighted squared error (Voelcker et al., 2022, Eq. 7), diagonal form.
 
         L = sum_j (dV/dx_j)^2 e_j^2,    e = prediction - sg(x),    dV/dx at sg(x)
 
@@ -29,6 +29,9 @@ def vagram_loss(value: Value, prediction: Array, target: Array) -> Array:
     Returns:
       `[...]` losses, in squared units of the value. Their gradient reaches `prediction` alone:
       the target, dV/dx and with it all that `value` closes over are stopped.
+
+    Raises:
+      AssertionError: the states have different shapes, or the values are not one for each.
     """
     error, gradient = _error_and_gradient(value, prediction, target)
     return jnp.square(gradient * error).sum(-1)
@@ -43,10 +46,17 @@ def vagram_taylor_loss(value: Value, prediction: Array, target: Array) -> Array:
     drift along it without bound, to where the expansion says nothing about the value;
     `vagram_loss` has no such direction but those that V ignores.
 
-    Args and gradients: as in `vagram_loss`.
+    Args:
+      value: maps `[..., n]` to `[...]`, each value from its own state alone.
+      prediction: `[..., n]` the model's next state.
+      target: `[..., n]` x, the true next state, or what the encoder makes of it.
 
     Returns:
-      `[...]` losses, in squared units of the value.
+      `[...]` losses, in squared units of the value. As in `vagram_loss`, their gradient reaches
+      `prediction` alone.
+
+    Raises:
+      AssertionError: the states have different shapes, or the values are not one for each.
     """
     error, gradient = _error_and_gradient(value, prediction, target)
     return jnp.square((gradient * error).sum(-1))
@@ -65,11 +75,18 @@ def vagram_second_order_loss(value: Value, prediction: Array, target: Array) -> 
     H e is a Hessian-vector product: no Hessian is built and none is decomposed. A network of
     ReLUs has H = 0 almost everywhere.
 
-    Args: as in `vagram_loss`; `value` is differentiated twice.
+    Args:
+      value: maps `[..., n]` to `[...]`, each value from its own state alone. It is
+        differentiated twice.
+      prediction: `[..., n]` the model's next state.
+      target: `[..., n]` x, the true next state, or what the encoder makes of it.
 
     Returns:
       `[...]` losses, in squared units of the value. The target and g are stopped. H e is not,
       as `prediction` is in it: the caller stops the critic's parameters.
+
+    Raises:
+      AssertionError: the states have different shapes, or the values are not one for each.
     """
     error, gradient = _error_and_gradient(value, prediction, target)
     curvature = (error * _hessian_product(value, target, error)).sum(-1)
@@ -85,12 +102,22 @@ def vagram_joint_loss(value: Value, prediction: Array, target: Array) -> Array:
 
         max(n, |e|^2) L  >=  (g . e + 1/2 e' H e)^2
 
-    L is zero only for errors in dims with g_j = 0 that H maps to 0. Symbols, arguments and
-    gradients are those of `vagram_second_order_loss`.
+    L is zero only for errors in dims with g_j = 0 that H maps to 0. Symbols are those of
+    `vagram_second_order_loss`; the first term is twice `vagram_loss`.
+
+    Args:
+      value: maps `[..., n]` to `[...]`, each value from its own state alone. It is
+        differentiated twice.
+      prediction: `[..., n]` the model's next state.
+      target: `[..., n]` x, the true next state, or what the encoder makes of it.
 
     Returns:
       `[...]` losses. The first term is in squared units of the value, the second also per
-      squared unit of x.
+      squared unit of x. The target and g are stopped. H e is not: the caller stops the
+      critic's parameters.
+
+    Raises:
+      AssertionError: the states have different shapes, or the values are not one for each.
     """
     error, gradient = _error_and_gradient(value, prediction, target)
     curvature = _hessian_product(value, target, error)

@@ -39,6 +39,9 @@ def value_alignment_loss(
     Returns:
       `[...]` losses in nats. Gradients reach both logits: the caller stops the critic's
       parameters, or the critic learns to be indifferent instead.
+
+    Raises:
+      AssertionError: the shapes differ.
     """
     stop = jax.lax.stop_gradient
     dynamics = categorical_kl(stop(value_logits), prior_value_logits)
@@ -58,7 +61,10 @@ def value_alignment_weight(latent_kl: Array, step: Array, *, warmup_steps: int) 
       warmup_steps: the weight is 0 up to and including this step.
 
     Returns:
-      `[...]` weights in [0, 1].
+      `[...]` weights in [0, 1], without gradient.
+
+    Raises:
+      AssertionError: `step` is not a scalar.
     """
     chex.assert_rank(step, 0)
     active = jnp.asarray(step > warmup_steps, jnp.float32)

@@ -16,20 +16,27 @@ Array = jax.Array
 def vaml_loss(prediction_values: Array, target_values: Array) -> Array:
     """Value-aware model learning (Farahmand et al., 2017), over an ensemble of critics.
 
-        L = max_k (mean_m V_k(x^_m) - sg V_k(x'))^2
+        L = max_{k=1..K} (1/M sum_{m=1..M} V_k(x^_m) - sg V_k(x'))^2
 
     The original takes the supremum over a class of value functions, of the squared error of
     the expected value. The maximum over K critics stands in for it, at each element: the mean
-    of these maxima is at least the largest mean error of any of the critics.
+    of these maxima is at least the largest mean error of any of the critics. M samples raise
+    L by their noise, as in `iter_vaml_loss`.
 
     Args:
-      prediction_values: `[K, M, ...]` V_k at M samples x^_m of the model's next state; M = 1
-        for a deterministic model.
-      target_values: `[K, ...]` V_k at the true next state x'.
+      prediction_values: `[K, M, ...]`: critics first, then samples, then one entry for each
+        transition, such as `[K, M, B, T]`. V_k at samples x^_1..x^_M of the model's next
+        state; M = 1 for a deterministic model.
+      target_values: `[K, ...]`, such as `[K, B, T]`: V_k at the true next state x', which has
+        no axis of samples.
 
     Returns:
-      `[...]` losses, in squared units of the values. Targets are stopped; the gradient reaches
-      the critic that is furthest off (shared where critics tie).
+      `[...]` losses, such as `[B, T]`, in squared units of the values. Targets are stopped. At
+      each transition the gradient reaches the predictions by the critic that is furthest off
+      alone (shared where critics tie); the caller stops the critics' parameters.
+
+    Raises:
+      AssertionError: the shapes do not fit each other.
     """
     return jax.vmap(iter_vaml_loss)(prediction_values, target_values).max(0)
 
@@ -48,13 +55,17 @@ def iter_vaml_loss(prediction_values: Array, target_value: Array) -> Array:
       target_value: `[...]` V at the true next state.
 
     Returns:
-      `[...]` losses, in squared units of the values. The target is stopped.
+      `[...]` losses, in squared units of the values. The target is stopped; the caller stops
+      the critic's parameters.
+
+    Raises:
+      AssertionError: the shapes do not fit each other.
     """
     return jnp.square(_deviations(prediction_values, target_value).mean(0))
 
 
 def cvaml_loss(prediction_values: Array, target_value: Array) -> Array:
-    """IterVAML without the bias of its samples: calibrated VAML (Voelcker et al., 2025).
+    """IterVAML without the bias of its samples: calibrated VAML (Voelcker et al., 2025b).
 
         L = (mean_m V(x^_m) - sg y)^2 - Var[V(x^)] / M
           = sum over i != j of (V(x^_i) - y) (V(x^_j) - y) / (M (M - 1))
@@ -72,10 +83,11 @@ def cvaml_loss(prediction_values: Array, target_value: Array) -> Array:
 
     Returns:
       `[...]` losses, in squared units of the values; single ones can be negative. The target
-      is stopped.
+      is stopped; the caller stops the critic's parameters.
 
     Raises:
       ValueError: fewer than two samples.
+      AssertionError: the shapes do not fit each other.
     """
     samples = prediction_values.shape[0]
     if samples < 2:
@@ -86,7 +98,7 @@ def cvaml_loss(prediction_values: Array, target_value: Array) -> Array:
 
 
 def categorical_iter_vaml_loss(prediction_logits: Array, target_logits: Array) -> Array:
-    """IterVAML between distributions of values, as in the public code of MAD-TD.
+    """IterVAML between distributions of values: public code of MAD-TD (Voelcker et al., 2025a).
 
         L = -sum_k sg v_k(x') log v_k(x^)
 
@@ -98,7 +110,10 @@ def categorical_iter_vaml_loss(prediction_logits: Array, target_logits: Array) -
       target_logits: `[..., bins]` logits of the same critic at the true next state.
 
     Returns:
-      `[...]` losses in nats. The target is stopped.
+      `[...]` losses in nats. The target is stopped; the caller stops the critic's parameters.
+
+    Raises:
+      AssertionError: the shapes differ.
     """
     chex.assert_equal_shape([prediction_logits, target_logits])
     target = jax.nn.softmax(jax.lax.stop_gradient(target_logits).astype(jnp.float32))
