@@ -1,5 +1,7 @@
 """Recorded episodes: the same that a score counts, whole, with what begins a batch."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +9,7 @@ import pytest
 import tiny
 import tiny_pixels
 import tiny_storm
+import tiny_vagram
 from analysis_records import make_policy
 
 from vawm import play
@@ -16,10 +19,12 @@ from vawm.envs.host.pool import Pool
 from vawm.envs.host.simulator import Outcome
 from vawm.errors import InvalidInput
 from vawm.policy import Policy
-from vawm.types import vector
+from vawm.types import image, vector
+
+CONFIGS = {"rssm": tiny.CONFIG, "storm": tiny_storm.CONFIG, "vagram": tiny_vagram.CONFIG}
 
 
-@pytest.fixture(scope="module", params=[tiny.CONFIG, tiny_storm.CONFIG], ids=["rssm", "storm"])
+@pytest.fixture(scope="module", params=CONFIGS.values(), ids=CONFIGS)
 def policy(request):
     return make_policy(request.param, tiny.env().spec)
 
@@ -49,6 +54,51 @@ def test_memory_is_what_replay_would_keep(policy, record):
     assert shapes == jax.tree.map(lambda x: x.shape, expected)
     for leaf in jax.tree.leaves(memory)[:1]:
         assert np.any(leaf[:, 0] != leaf[:, 1])
+
+
+def test_a_policy_that_watches_its_own_episodes_remembers_the_same(policy, record):
+    """With the key that acted; where no latent is drawn, with any, whatever it would do."""
+    if policy.config.agent == "vagram":
+        again = episodes.watched_by(policy, record, seed=9)
+        assert again.trajectory is record.trajectory
+        assert again.length is record.length
+    else:
+        agent = make_agent(policy.config, policy.spec)
+        remember = jax.jit(functools.partial(episodes.remember, agent))
+        key_act = jax.random.split(jax.random.key(3))[1]
+        memory = remember(policy.params, policy.state, key_act, record.trajectory)
+        again = record._replace(memory=memory)
+    assert jax.tree.structure(again.memory) == jax.tree.structure(record.memory)
+    for actual, expected in zip(
+        *map(jax.tree.leaves, (again.memory, record.memory)), strict=True
+    ):
+        assert actual.dtype == expected.dtype
+        np.testing.assert_allclose(actual, expected, atol=1e-5)
+
+
+SPEC = tiny.env().spec
+
+
+@pytest.mark.parametrize(
+    ("other", "message"),
+    [
+        ({"task": "another"}, "player='task another': b was trained with probe_"),
+        ({"obs": vector(3)}, r"player='obs Shape.*\(3,\).*': b was trained with Shape.*\(2,\)"),
+        ({"obs": {"a": vector(2)}}, "obs {'a': Shape.*: b was trained with Shape"),
+        ({"obs": image(48)}, r"player='obs Shape.*uint8.*: b was trained with Shape.*float32"),
+        ({"action_size": 2}, "player='action_size 2': b was trained with 1; let a run of the"),
+        ({"discrete": True}, "player='discrete True': b was trained with False"),
+        ({"action_repeat": 2}, "player='action_repeat 2': b was trained with 1"),
+    ],
+)
+def test_episodes_of_another_kind_are_not_watched(other, message):
+    with pytest.raises(InvalidInput, match=message) as error:
+        episodes.check_can_watch("b", SPEC, SPEC._replace(**other))
+    assert "\n" not in str(error.value)
+
+
+def test_how_many_environments_there_were_does_not_matter():
+    episodes.check_can_watch("b", SPEC, SPEC._replace(num_envs=9, episode_length=None))
 
 
 class Count:

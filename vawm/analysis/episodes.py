@@ -2,12 +2,17 @@
 
 As in `vawm.play`, which episodes there are is fixed before the first begins. Environments are
 those of the run's own config, so rewards and ends are those that the critic was trained on.
+
+World models that are judged each on its own policy's episodes differ in where they are judged
+too. To compare them on the same steps, one policy plays, and every world model remembers anew
+what it would have, had it watched: `watched_by`.
 """
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -16,13 +21,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from vawm import evaluate, suites
-from vawm.agent import Agent, make_agent
+from vawm.agent import Agent, PolicyCarry, make_agent
 from vawm.config import HostEnvConfig
 from vawm.envs.protocol import Environment, HostEnvironment
 from vawm.errors import InvalidInput
 from vawm.play import FRESH, How
 from vawm.policy import Policy
-from vawm.types import Batch, Key, Params, PyTree, TimeStep, Trajectory
+from vawm.types import Batch, EnvSpec, Key, Params, PyTree, TimeStep, Trajectory
 
 
 class Episodes(NamedTuple):
@@ -169,6 +174,65 @@ def join(episodes: Sequence[Sequence[PyTree]]) -> Episodes:
     ]
     trajectory, memory = jax.tree.map(lambda *x: np.stack(x), *rows)
     return Episodes(trajectory, memory, np.array([len(e) for e in episodes], np.int32))
+
+
+def remember(
+    agent: Agent, params: Params, state: PyTree, key: Key, trajectory: Trajectory
+) -> PyTree:
+    """`[E, T, ...]` what replay would keep beside every recorded step, had this agent seen it.
+
+    The agent acts, `Agent.act`, but what leaves from a step is the action that was recorded.
+    So the agent that recorded the steps finds again what it remembered: with the same key,
+    and, where its latents are not drawn, with any. Pure; can be jitted.
+
+    Args:
+      agent: whose world model watches.
+      params: of the agent.
+      state: of its world model.
+      key: for latents.
+      trajectory: `[E, T, ...]`, from the first steps of episodes on.
+    """
+    episodes, length = trajectory.reward.shape
+
+    def step(carry: PolicyCarry, inputs: tuple[Key, Trajectory]):
+        key, (*arrived, action) = inputs
+        carry, _ = agent.act(params, state, key, carry, TimeStep(*arrived))
+        return carry._replace(action=action), agent.world_model.memory(carry.memory)
+
+    steps = jax.tree.map(lambda x: x.swapaxes(0, 1), trajectory)
+    keys = jax.random.split(key, length)
+    _, memory = jax.lax.scan(step, agent.initial(episodes), (keys, steps))
+    return jax.tree.map(lambda x: x.swapaxes(0, 1), memory)
+
+
+def watched_by(policy: Policy, episodes: Episodes, *, seed: int) -> Episodes:
+    """The same steps, beside them what the world model of `policy` remembers of them.
+
+    Whether it could have seen such steps is for `check_can_watch`.
+    """
+    agent = make_agent(policy.config, policy.spec)
+    infer = jax.jit(functools.partial(remember, agent))
+    key = jax.random.key(seed)
+    memory = infer(policy.params, policy.state, key, episodes.trajectory)
+    return episodes._replace(memory=memory)
+
+
+def check_can_watch(name: str, spec: EnvSpec, player: EnvSpec) -> None:
+    """Refuses to judge a run on episodes of environments that are not like its own.
+
+    Args:
+      name: of the run.
+      spec: of the environments that it was trained in.
+      player: of those that are played.
+
+    Raises:
+      InvalidInput: names what differs: the task, observations, actions or action repeat.
+    """
+    for field in EnvSpec._fields:
+        own, theirs = getattr(spec, field), getattr(player, field)
+        if own != theirs and field not in ("num_envs", "episode_length"):
+            remedy = f"{name} was trained with {own}; let a run of the same play"
+            raise InvalidInput("player", f"{field} {theirs}", remedy)
 
 
 def select(episodes: Episodes, index: int) -> Episodes:
