@@ -6,8 +6,9 @@ import json
 import numpy as np
 import pytest
 import tiny
+import tiny_pixels
 
-from vawm import rundir
+from vawm import resume, rundir, validate
 from vawm.analysis import curves
 from vawm.errors import InvalidInput
 
@@ -45,6 +46,29 @@ def test_runs_that_differ_in_their_seed_alone_are_one_group():
         f"{start} adaptive (2)",
     ]
     assert [len(own) for own in groups.values()] == [2, 1, 1, 1]
+
+
+def changed(config, name, value):
+    """`config` with another value of a field, which may be one of a part."""
+    first, _, rest = name.partition(".")
+    if rest:
+        value = changed(getattr(config, first), rest, value)
+    return dataclasses.replace(config, **{first: value})
+
+
+@pytest.mark.parametrize("name", resume.MAY_DIFFER)
+def test_what_a_resumed_run_may_change_makes_no_other_group(name):
+    own = dict(validate.values(tiny_pixels.CONFIG))[name]
+    other = "other" if isinstance(own, str) else own + 1
+    config = changed(tiny_pixels.CONFIG, name, other)
+    assert config != tiny_pixels.CONFIG
+    groups = curves.group([run(tiny_pixels.CONFIG, []), run(config, [], seed=1)])
+    assert [len(own) for own in groups.values()] == [2]
+
+
+def test_a_choice_deep_in_the_config_makes_another_group():
+    config = changed(tiny_pixels.CONFIG, "critic.slow_rate", 0.5)
+    assert len(curves.group([run(tiny_pixels.CONFIG, []), run(config, [])])) == 2
 
 
 def test_a_curve_is_mean_and_range_by_hand():

@@ -1,19 +1,18 @@
 """Losses and the weight of value alignment in training, from `metrics.jsonl`: Figs 8, 9, 12.
 
-Runs that differ in nothing but their seed are one group: its curve is their mean, with the
-lowest and the highest of them around it.
+Runs that differ in nothing but their seed, and in what a resumed run may change, are one group:
+its curve is their mean, with the lowest and the highest of them around it.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import pathlib
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
-from vawm import rundir, tracking
+from vawm import resume, rundir, tracking, validate
 from vawm.config import Config
 from vawm.errors import InvalidInput
 from vawm.tracking import Line
@@ -68,12 +67,22 @@ def describe(config: Config) -> str:
     return f"{config.task}, {config.agent}, alignment {alignment.weight}{weight}"
 
 
-def group(runs: Sequence[Run]) -> dict[str, list[Run]]:
+class Configured(Protocol):
+    """A run, whatever else is known of it."""
+
+    @property
+    def config(self) -> Config: ...
+
+
+AnyRun = TypeVar("AnyRun", bound=Configured)
+
+
+def group(runs: Sequence[AnyRun]) -> dict[str, list[AnyRun]]:
     """Runs by what they share, in the order of the first of each.
 
     Groups of one description that differ in other choices get numbers.
     """
-    groups: list[list[Run]] = []
+    groups: list[list[AnyRun]] = []
     for run in runs:
         own = next((g for g in groups if _alike(g[0].config, run.config)), None)
         if own is None:
@@ -89,7 +98,13 @@ def group(runs: Sequence[Run]) -> dict[str, list[Run]]:
 
 
 def _alike(a: Config, b: Config) -> bool:
-    return dataclasses.replace(a, seed=0) == dataclasses.replace(b, seed=0)
+    return _choices(a) == _choices(b)
+
+
+def _choices(config: Config) -> dict[str, Any]:
+    """All that the runs of a group have in common."""
+    free = {"seed", *resume.MAY_DIFFER}
+    return {name: value for name, value in validate.values(config) if name not in free}
 
 
 def curve(runs: Sequence[Run], metric: str) -> Curve | None:
