@@ -2,6 +2,7 @@
 
     python experiments/analyse.py --logdirs runs/aligned runs/plain
     python experiments/analyse.py --logdirs runs/aligned --what values --episodes 20 --depth 15
+    python experiments/analyse.py --logdirs runs/aligned runs/plain --player runs/plain
 
     trajectories   imagination against the truth, Figs 3 and 7
     saliency       what decoder and value depend on, Figs 3 and 13
@@ -9,7 +10,10 @@
     curves         losses and the weight of value alignment in training, Figs 8, 9 and 12
 
 Plays whole episodes of every run in its own environments; all but `curves` is read from these.
-Works for every agent, from vectors and from pixels. Needs the extra `analysis`.
+With `--player` one run plays, and all are judged on its episodes, wherever their own policies
+would have gone. Runs that differ in nothing but their seed are one group, whose mean value
+errors have standard errors over runs. Works for every agent, from vectors and from pixels.
+Needs the extra `analysis`.
 """
 
 from __future__ import annotations
@@ -36,6 +40,7 @@ from vawm.analysis import (
     values,
 )
 from vawm.analysis.episodes import Episodes
+from vawm.config import Config
 from vawm.envs.protocol import check_positive
 from vawm.errors import InvalidInput
 from vawm.policy import Policy
@@ -67,6 +72,9 @@ class Options:
     """of the value that saliency differentiates"""
     how: Literal["sample", "mode"] = "sample"
     """sample actions from the policy, or take its mode"""
+    player: pathlib.Path | None = None
+    """folder of the run that plays the episodes on which all are judged; by default each run
+    plays its own"""
     seed: int = 0
 
     def wants(self, what: str) -> bool:
@@ -74,10 +82,23 @@ class Options:
 
 
 class Loaded(NamedTuple):
-    """Runs by name; policies only where they are needed."""
+    """Runs by name, and who plays for all; policies only where they are needed."""
 
     policies: dict[str, Policy]
     runs: dict[str, curves.Run]
+    player: Policy | None
+
+
+class Played(NamedTuple):
+    """A run, and the episodes on which it is judged."""
+
+    name: str
+    policy: Policy
+    record: Episodes
+
+    @property
+    def config(self) -> Config:
+        return self.policy.config
 
 
 def names(logdirs: Sequence[pathlib.Path]) -> list[str]:
@@ -106,19 +127,27 @@ def prepare(options: Options) -> Loaded:
     called = dict(zip(names(options.logdirs), options.logdirs, strict=True))
     rundir.check_writable(options.output, "output")
     figures.check()
-    loaded = Loaded({}, {})
-    for name, logdir in called.items():
-        if options.what != "curves":
-            policy = policy_lib.load(logdir)
-            inference.check(policy.config, context=options.context, depth=options.depth)
-            if options.wants("trajectories") and any(
-                map(is_image, jax.tree.leaves(policy.spec.obs))
-            ):
-                movies.check()
-            loaded.policies[name] = policy
-        if options.wants("curves"):
-            loaded.runs[name] = curves.read(logdir)
+    plays = options.what != "curves"
+    loaded = Loaded(
+        policies={name: policy_lib.load(path) for name, path in called.items() if plays},
+        runs={
+            name: curves.read(path) for name, path in called.items() if options.wants("curves")
+        },
+        player=policy_lib.load(options.player) if plays and options.player else None,
+    )
+    for name, policy in loaded.policies.items():
+        check(options, name, policy, loaded.player)
     return loaded
+
+
+def check(options: Options, name: str, policy: Policy, player: Policy | None) -> None:
+    """Refuses a run of which what is wanted cannot be shown."""
+    if player is not None:
+        episodes.check_can_watch(name, policy.spec, player.spec)
+    inference.check(policy.config, context=options.context, depth=options.depth)
+    has_images = any(map(is_image, jax.tree.leaves(policy.spec.obs)))
+    if options.wants("trajectories") and has_images:
+        movies.check()
 
 
 def show_curves(options: Options, runs: dict[str, curves.Run]) -> None:
@@ -127,9 +156,9 @@ def show_curves(options: Options, runs: dict[str, curves.Run]) -> None:
     figures.curves(found, options.output / "curves.png")
 
 
-def show_trajectories(options: Options, played: dict[str, tuple[Policy, Episodes]]) -> None:
+def show_trajectories(options: Options, played: Sequence[Played]) -> None:
     rows = []
-    for name, (policy, record) in played.items():
+    for name, policy, record in played:
         shown = trajectories.imagine(
             policy, record, context=options.context, depth=options.depth, seed=options.seed
         )
@@ -146,7 +175,7 @@ def show_trajectories(options: Options, played: dict[str, tuple[Policy, Episodes
     tables.write_csv(rows, options.output / "trajectories.csv")
 
 
-def show_saliency(options: Options, played: dict[str, tuple[Policy, Episodes]]) -> None:
+def show_saliency(options: Options, played: Sequence[Played]) -> None:
     looks = {
         name: saliency.look(
             policy,
@@ -156,7 +185,7 @@ def show_saliency(options: Options, played: dict[str, tuple[Policy, Episodes]]) 
             seed=options.seed,
             unit=options.unit,
         )
-        for name, (policy, record) in played.items()
+        for name, policy, record in played
     }
     rows: list[dict[str, Any]] = []
     with_vectors = {}
@@ -171,41 +200,73 @@ def show_saliency(options: Options, played: dict[str, tuple[Policy, Episodes]]) 
     tables.write_csv(rows, options.output / "saliency.csv")
 
 
-def show_values(options: Options, played: dict[str, tuple[Policy, Episodes]]) -> None:
-    """Prints a table of what it found."""
+def show_values(options: Options, played: Sequence[Played]) -> None:
+    """Prints a table of what it found, and which groups it pooled at different steps."""
     reports = {
         name: values.report(
             policy, record, context=options.context, depth=options.depth, seed=options.seed
         )
-        for name, (policy, record) in played.items()
+        for name, policy, record in played
     }
-    rows = [row for name, run in reports.items() for row in values.rows(name, run.by_depth)]
+    groups = curves.group(played)
+    pooled = values.pooled(
+        reports, {group: [run.name for run in runs] for group, runs in groups.items()}
+    )
+    entries = reports | pooled
+    rows = [row for name, entry in entries.items() for row in values.rows(name, entry)]
     tables.write_csv(rows, options.output / "values.csv")
-    figures.value_errors(reports, options.output / "values_by_depth.png")
-    for name, run in reports.items():
-        figures.values(name, run, options.output / f"values_{name}.png")
-    print(values.table(reports))
+    figures.value_errors(pooled, options.output / "values_by_depth.png")
+    for name, report in reports.items():
+        figures.values(name, report, options.output / f"values_{name}.png")
+    print(values.table(entries))
+    for group, runs in groups.items():
+        steps = sorted({run.policy.env_steps for run in runs})
+        if len(steps) > 1:
+            print(f"{group}: its runs are at {', '.join(map(str, steps))} environment steps")
 
 
-def play(options: Options, policies: dict[str, Policy]) -> dict[str, tuple[Policy, Episodes]]:
-    """Records the episodes of every run, and notes what they earned in `summary.json`."""
-    played, summary = {}, {}
-    for name, policy in policies.items():
-        record = episodes.record(
+def play(options: Options, loaded: Loaded) -> list[Played]:
+    """Records the episodes of every run, or of the one that plays for all.
+
+    Writes what they earned to `summary.json`.
+    """
+
+    def record(name: str, policy: Policy) -> Episodes:
+        found = episodes.record(
             policy, episodes=options.episodes, seed=options.seed, how=options.how
         )
-        played[name] = policy, record
-        returns = [round(float(x), 3) for x in record.returns]
-        summary[name] = {
-            "run": curves.describe(policy.config),
-            "seed": policy.config.seed,
-            "env_steps": policy.env_steps,
-            "returns": returns,
-            "steps": [int(x) for x in record.length],
-        }
-        print(f"{name}: {evaluate.Score(tuple(returns))}", flush=True)
-    tables.write_json(summary, options.output / "summary.json")
+        print(f"{name}: {evaluate.Score(tuple(found.returns))}", flush=True)
+        return found
+
+    if loaded.player is None:
+        played = [
+            Played(name, policy, record(name, policy))
+            for name, policy in loaded.policies.items()
+        ]
+    else:
+        shared = record(f"{options.player}, which plays for all", loaded.player)
+        played = [
+            Played(name, policy, episodes.watched_by(policy, shared, seed=options.seed))
+            for name, policy in loaded.policies.items()
+        ]
+    tables.write_json(summary(options, played), options.output / "summary.json")
     return played
+
+
+def summary(options: Options, played: Sequence[Played]) -> dict[str, dict[str, Any]]:
+    """Of each run: its group, and the episodes on which it is judged."""
+    return {
+        run.name: {
+            "group": group,
+            "seed": run.config.seed,
+            "env_steps": run.policy.env_steps,
+            "player": run.name if options.player is None else str(options.player),
+            "returns": [round(float(x), 3) for x in run.record.returns],
+            "steps": [int(x) for x in run.record.length],
+        }
+        for group, runs in curves.group(played).items()
+        for run in runs
+    }
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -217,7 +278,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if options.wants("curves"):
         show_curves(options, loaded.runs)
     if loaded.policies:
-        played = play(options, loaded.policies)
+        played = play(options, loaded)
         for what, show in {
             "trajectories": show_trajectories,
             "saliency": show_saliency,

@@ -1,9 +1,13 @@
 """Policies with made-up parameters, and made-up episodes: nothing is compiled for them."""
 
+import json
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+import toy
 
+from vawm import checkpoint, rundir
 from vawm.agent import make_agent
 from vawm.analysis.episodes import Episodes
 from vawm.policy import Policy
@@ -20,6 +24,24 @@ def make_policy(config, spec, seed=0):
     state = jax.tree.map(lambda x: jnp.ones(x.shape, x.dtype), state)
     act = jax.jit(agent.act, static_argnames="how")
     return Policy(config, spec, 0, params, state, agent.initial, act)
+
+
+def save_run(logdir, policy, *, env_steps=8):
+    """The folder of a run that saved what acting needs, with two lines of metrics."""
+    state = toy.state()
+    learner = state.learner._replace(params=policy.params, model_state=policy.state)
+    checkpoint.save(
+        logdir,
+        state._replace(learner=learner),
+        env_steps=env_steps,
+        config=policy.config,
+        spec=policy.spec,
+        progress={},
+    )
+    rundir.write_config(logdir, policy.config)
+    lines = [{"env_steps": n, "latent/kl": n / 8, "loss/dynamics": None} for n in (8, 16)]
+    (logdir / "metrics.jsonl").write_text("".join(json.dumps(x) + "\n" for x in lines))
+    return str(logdir)
 
 
 def make_episodes(policy, *, episodes, length, seed=0):

@@ -9,6 +9,7 @@ import pytest
 import scalar_agent
 import tiny
 import tiny_storm
+import tiny_vagram
 from analysis_records import make_episodes, make_policy
 
 from vawm.analysis import episodes, inference, values
@@ -48,7 +49,7 @@ def bump_mean(center):
 
 
 def twin(steps, length, terminal):
-    """Errors of one episode, in loops: measure -> depth -> list over states."""
+    """One episode in loops: errors, measure -> depth -> list over states; V of those left."""
     w, gamma = float(scalar_agent.PARAMS.critic), 0.9
     w_reward = float(scalar_agent.PARAMS.world_model)
     obs, reward, action = (np.asarray(x, np.float64).ravel() for x in steps)
@@ -81,7 +82,7 @@ def twin(steps, length, terminal):
                 if t + k < length - 1:
                     errors[name][k].append(abs(value - truth[t + k]))
             imagined += action[t + k]
-    return errors
+    return errors, [bump_mean(np.array(w * h[t]))[0] for t in range(1, length - 1)]
 
 
 @pytest.fixture(scope="module")
@@ -98,14 +99,29 @@ def scalar():
     return recorded, stacked, values.compare(stacked, recorded, discount=0.9)
 
 
+@pytest.fixture(scope="module")
+def loops(scalar):
+    """What `twin` makes of every episode."""
+    steps = scalar[0].trajectory
+    return [
+        twin(
+            (steps.obs[i], steps.reward[i], steps.action[i]),
+            length,
+            bool(steps.is_terminal[i, length - 1]),
+        )
+        for i, length in enumerate(LENGTH)
+    ]
+
+
 @pytest.mark.parametrize("measure", values.MEASURES)
-def test_every_measure_is_that_of_the_loops(scalar, measure):
-    recorded, _, report = scalar
-    steps = recorded.trajectory
-    for i, length in enumerate(LENGTH):
-        ends = bool(steps.is_terminal[i, length - 1])
-        own = twin((steps.obs[i], steps.reward[i], steps.action[i]), length, ends)[measure]
-        expected = [np.mean(errors) if errors else np.nan for errors in own]
+def test_every_measure_is_that_of_the_loops(scalar, loops, measure):
+    report, unit = scalar[2], 1.0
+    if measure in values.RELATIVE:
+        unit = np.std([value for _, left in loops for value in left])
+        assert report.spread == pytest.approx(unit, rel=1e-4)
+    for i, (errors, _) in enumerate(loops):
+        own = errors[values.RELATIVE.get(measure, measure)]
+        expected = [np.mean(errors) / unit if errors else np.nan for errors in own]
         actual = report.by_depth.errors[measure][i]
         np.testing.assert_allclose(actual, expected, rtol=2e-4, atol=1e-5)
         assert report.by_depth.states[measure][i].tolist() == [len(errors) for errors in own]
@@ -120,9 +136,89 @@ def test_episodes_and_not_states_are_the_units(scalar):
     expected = errors[:2, 1].std(ddof=1) / np.sqrt(2)
     np.testing.assert_allclose(by_depth.standard_error("value")[1], expected)
     assert np.isnan(by_depth.standard_error("value")[3])  # of one episode
-    rows = [row for row in values.rows("a", by_depth) if row["measure"] == "value"]
-    assert [row["episodes"] for row in rows] == [3, 2, 2, 1]
+    rows = [row for row in values.rows("a", scalar[2]) if row["measure"] == "value"]
+    assert [row["count"] for row in rows] == [3, 2, 2, 1]
     assert [row["states"] for row in rows] == [10, 7, 5, 3]
+    assert {row["over"] for row in rows} == {"episodes"}
+
+
+def test_relative_errors_do_not_depend_on_the_unit_of_rewards(scalar):
+    recorded, rolled, report = scalar
+    reward = 7.0 * recorded.trajectory.reward
+    larger = values.compare(
+        rolled._replace(value=7.0 * rolled.value),
+        recorded._replace(trajectory=recorded.trajectory._replace(reward=reward)),
+        discount=0.9,
+    )
+    assert larger.spread == pytest.approx(7 * report.spread)
+    for name, of in values.RELATIVE.items():
+        actual, expected = (r.by_depth.errors[name] for r in (larger, report))
+        np.testing.assert_allclose(actual, expected, rtol=1e-5)
+        actual, expected = (r.by_depth.errors[of] for r in (larger, report))
+        np.testing.assert_allclose(actual, 7 * expected, rtol=1e-5)
+
+
+def test_values_that_do_not_differ_have_no_relative_errors(scalar):
+    recorded, rolled, report = scalar
+    flat = values.compare(
+        rolled._replace(value=np.full_like(rolled.value, 0.1)), recorded, discount=0.9
+    )
+    assert flat.spread == 0
+    for name, of in values.RELATIVE.items():
+        assert np.isnan(flat.by_depth.errors[name]).all()
+        np.testing.assert_array_equal(
+            np.isnan(flat.by_depth.errors[of]), np.isnan(report.by_depth.errors[of])
+        )
+    assert "0: nan +- nan" in values.table({"a": flat}, measures=("relative_value",))
+    rows = [row for row in values.rows("a", flat) if row["measure"] == "relative_value"]
+    assert {row["count"] for row in rows} == {0}
+
+
+def test_a_spread_by_hand():
+    assert values.spread_of(np.array([1.0, 1.0, 3.0, 3.0])) == 1.0
+    assert values.spread_of(np.array([3.0, 3.0 + 1e-9])) == 0.0  # float32 rounds to 2e-7
+    assert values.spread_of(np.array([])) == 0.0
+    assert np.isnan(values.relative(np.array([0.0, 2.0]), 0.0)).all()
+
+
+def told(errors, spread):
+    """A report of which only the errors and the spread are told."""
+    errors = np.array(errors)
+    by_depth = values.ErrorByDepth(
+        states={name: np.where(np.isnan(errors), 0, 4) for name in values.MEASURES},
+        errors=dict.fromkeys(values.MEASURES, errors)
+        | {name: values.relative(errors, spread) for name in values.RELATIVE},
+    )
+    return values.Report(by_depth, 1, *5 * [np.zeros((2, 3))], spread)
+
+
+def test_runs_are_the_units_of_a_group_by_hand():
+    reports = {
+        "a": told([[1.0, 2.0], [3.0, np.nan]], 2.0),  # on the mean 2, 2
+        "b": told([[4.0, 6.0], [6.0, 2.0]], 0.0),  # 5, 4; its values do not differ
+        "c": told([[9.0, 9.0]], 1.0),
+        "d": told([[8.0, 0.0], [8.0, 0.0]], 4.0),  # 8, 0
+    }
+    entries = values.pooled(reports, {"alike": ["a", "b", "d"], "other": ["c"]})
+    assert list(entries) == ["alike (3 runs)", "c"]
+    assert entries["c"] is reports["c"]
+    group = entries["alike (3 runs)"]
+    np.testing.assert_allclose(group.by_depth.mean("value"), [5.0, 2.0])
+    error = np.array([3.0, 2.0]) / np.sqrt(3)  # deviations -3, 0, 3 and 0, 2, -2
+    np.testing.assert_allclose(group.by_depth.standard_error("value"), error)
+    np.testing.assert_allclose(group.by_depth.mean("relative_value"), [1.5, 0.5])
+    assert group.spread == 2.0
+    rows = {(r["measure"], r["depth"]): r for r in values.rows("alike", group)}
+    assert rows["value", 1]["over"] == "runs"
+    assert [rows[name, 1]["count"] for name in ("value", "relative_value")] == [3, 2]
+    assert rows["value", 1]["states"] == 4 + 8 + 8
+    lines = values.table(reports | entries).splitlines()
+    assert lines[:2] == [
+        "value error by depth",
+        "  a                0: 2 +- 1   1: 2 +- nan",
+    ]
+    assert lines[5] == "  alike (3 runs)   0: 5 +- 1.7   1: 2 +- 1.2"
+    assert lines[-1] == "  alike (3 runs)   2"
 
 
 def test_what_lies_beyond_the_end_does_not_count(scalar):
@@ -151,7 +247,10 @@ def test_returns_by_hand():
     np.testing.assert_array_equal(tail, [[4.0, 6.0, 8.0, 8.0, 0.0]])
 
 
-@pytest.fixture(scope="module", params=[tiny.CONFIG, tiny_storm.CONFIG], ids=["rssm", "storm"])
+CONFIGS = {"rssm": tiny.CONFIG, "storm": tiny_storm.CONFIG, "vagram": tiny_vagram.CONFIG}
+
+
+@pytest.fixture(scope="module", params=CONFIGS.values(), ids=CONFIGS)
 def played(request):
     """An agent and its episodes of 13 steps."""
     policy = make_policy(request.param, tiny.env().spec)
@@ -169,7 +268,7 @@ def test_at_depth_zero_imagined_is_inferred(played):
 
 def test_every_state_with_a_context_is_inferred(played):
     policy, recorded, report = played
-    first = 1 if policy.config.agent == "dreamerv3" else 2  # the last of a window of 3
+    first = 2 if policy.config.agent == "storm" else 1  # the last of a window of 3
     assert report.first == first
     assert report.value.shape == (2, 13 - first)
     assert report.by_depth.states["value"][0].tolist() == [13 - first - k for k in range(5)]

@@ -17,7 +17,7 @@ from vawm.analysis import trajectories as trajectories_lib
 from vawm.analysis.curves import METRICS, Curves
 from vawm.analysis.saliency import Look
 from vawm.analysis.trajectories import Trajectories
-from vawm.analysis.values import MEASURES, Report
+from vawm.analysis.values import MEASURES, Group, Report
 from vawm.runner import RunError
 
 DPI = 110
@@ -32,6 +32,9 @@ LABELS = {
     "value_kl": "KL of the critic's distributions (nats)",
     "latent_kl": "KL of posterior and prior (nats)",
     "distance": "half squared distance of z, mean over categoricals",
+    "relative_value": "|V(imagined) - V(inferred)| / spread",
+    "relative_return": "|V(imagined) - return| / spread",
+    "relative_bootstrapped": "|V(imagined) - bootstrapped return| / spread",
 }
 MAPS = {
     "sensitivity": "decoder's sensitivity to z",
@@ -63,19 +66,22 @@ def panels(
     figure.savefig(path, dpi=DPI)
 
 
-def value_errors(reports: Mapping[str, Report], path: pathlib.Path) -> None:
-    """Every measure by depth, a colour per run; bands are standard errors over episodes."""
+def value_errors(entries: Mapping[str, Report | Group], path: pathlib.Path) -> None:
+    """Every measure by depth, a line per run or group of runs.
+
+    Bands are standard errors, over the episodes of a run or over the runs of a group.
+    """
     shown = [
         measure
         for measure in MEASURES
-        if any(np.isfinite(run.by_depth.errors[measure]).any() for run in reports.values())
+        if any(np.isfinite(run.by_depth.errors[measure]).any() for run in entries.values())
     ]
     columns = min(4, len(shown))
     with panels(path, -(-len(shown) // columns), columns, size=(3.6, 2.9)) as axes:
         for ax in axes.ravel()[len(shown) :]:
             ax.set_visible(False)
         for ax, measure in zip(axes.ravel(), shown, strict=False):
-            for color, (name, run) in enumerate(reports.items()):
+            for color, (name, run) in enumerate(entries.items()):
                 mean = run.by_depth.mean(measure)
                 error = np.nan_to_num(run.by_depth.standard_error(measure))
                 depth = np.arange(len(mean))
@@ -86,7 +92,7 @@ def value_errors(reports: Mapping[str, Report], path: pathlib.Path) -> None:
             ax.set_title(LABELS[measure], fontsize=9)
             ax.set_xlabel("steps of imagination", fontsize=9)
             ax.set_ylim(bottom=0)
-        axes[0, 0].legend(fontsize=8)
+        _legend_below(axes)
 
 
 def values(name: str, report: Report, path: pathlib.Path, *, rollouts: int = 12) -> None:
@@ -258,5 +264,10 @@ def curves(all_curves: Curves, path: pathlib.Path) -> None:
                     )
             ax.set_title(metric, fontsize=9)
             ax.set_xlabel("thousand environment steps", fontsize=9)
-        handles, labels = axes[0, 0].get_legend_handles_labels()
-        axes[0, 0].figure.legend(handles, labels, loc="outside lower center", fontsize=8)
+        _legend_below(axes)
+
+
+def _legend_below(axes: np.ndarray) -> None:
+    """The names of the first panel's lines, which are those of all."""
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    axes[0, 0].figure.legend(handles, labels, loc="outside lower center", fontsize=8)

@@ -19,13 +19,22 @@ for the returns only states that an action left from, T being the step of the la
 online critic's mean, in units of the reward. An episode cut by a time limit misses what would
 have come: "return" leaves that out of G, "bootstrapped" takes the critic's word for it.
 
+A critic whose values hardly differ has small errors whatever its world model does. So the
+first three are also told relative to the run's own values:
+
+    relative_value, relative_return, relative_bootstrapped    the error / spread
+    spread    standard deviation (that of a population) of V(s_t) over the inferred states s_t
+              that an action left from, those of all episodes that are judged taken together
+
+Where the spread is 0 they are NaN. Standard errors take the spread for granted.
+
 Source: our reading of Figs 3 and 7, which show imagined trajectories as pictures.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -126,6 +135,8 @@ def make_rollouts(
     return rollouts
 
 
+RELATIVE = {f"relative_{name}": name for name in ("value", "return", "bootstrapped")}
+"""Measures that are another one divided by the spread of the run's values."""
 MEASURES = (
     "value",
     "return",
@@ -134,27 +145,34 @@ MEASURES = (
     "value_kl",
     "latent_kl",
     "distance",
+    *RELATIVE,
 )
 
 
 class ErrorByDepth(NamedTuple):
-    """Errors of E episodes at depths 0..K; the episodes are the units of the standard error.
+    """Errors of E units at depths 0..K: of the episodes of a run, or of the runs of a group.
 
     Attributes:
-      states: measure -> `[E, K + 1]` states of the episode that reach so deep within it.
-      errors: measure -> `[E, K + 1]`, mean over these states; NaN where there is none.
+      states: measure -> `[E, K + 1]` states of the unit that reach so deep within an episode.
+      errors: measure -> `[E, K + 1]`, the unit's mean; NaN where it has none.
+      units: what E counts, and standard errors are over.
     """
 
     states: dict[str, np.ndarray]
     errors: dict[str, np.ndarray]
+    units: Literal["episodes", "runs"] = "episodes"
 
     def mean(self, measure: str) -> np.ndarray:
-        """`[K + 1]` over the episodes that reach so deep; NaN where none does."""
+        """`[K + 1]` over the units that have an error so deep; NaN where none has."""
         return mean_and_error(self.errors[measure])[0]
 
     def standard_error(self, measure: str) -> np.ndarray:
-        """`[K + 1]` of `mean`; NaN below two episodes."""
+        """`[K + 1]` of `mean`; NaN below two units."""
         return mean_and_error(self.errors[measure])[1]
+
+    def number(self, measure: str) -> np.ndarray:
+        """`[K + 1]` of units that `mean` is over."""
+        return (~np.isnan(self.errors[measure])).sum(0)
 
 
 class Report(NamedTuple):
@@ -168,6 +186,7 @@ class Report(NamedTuple):
       returns: `[E, N]` G there.
       bootstrapped: `[E, N]` the same with what the critic says of the last state.
       counts: `[E, N]` bool, whether an action left from there.
+      spread: standard deviation of V where that is so.
     """
 
     by_depth: ErrorByDepth
@@ -177,6 +196,19 @@ class Report(NamedTuple):
     returns: np.ndarray
     bootstrapped: np.ndarray
     counts: np.ndarray
+    spread: float
+
+
+class Group(NamedTuple):
+    """Of runs that differ in nothing but their seed.
+
+    Attributes:
+      by_depth: a row for each run, its mean over its episodes.
+      spread: mean over the runs.
+    """
+
+    by_depth: ErrorByDepth
+    spread: float
 
 
 def report(
@@ -232,7 +264,9 @@ def compare(rollouts: Rollouts, episodes: Episodes, *, discount: float) -> Repor
         "latent_kl": rollouts.latent_kl,
         "distance": rollouts.distance,
     }
-    masks = {name: left if name in truth else reached for name in errors}
+    spread = spread_of(value[left[..., 0]])
+    errors |= {name: relative(errors[of], spread) for name, of in RELATIVE.items()}
+    masks = {name: left if RELATIVE.get(name, name) in truth else reached for name in errors}
     return Report(
         by_depth=ErrorByDepth(
             states={name: mask.sum(1) for name, mask in masks.items()},
@@ -244,6 +278,58 @@ def compare(rollouts: Rollouts, episodes: Episodes, *, discount: float) -> Repor
         returns=truth["return"],
         bootstrapped=truth["bootstrapped"],
         counts=left[..., 0],
+        spread=spread,
+    )
+
+
+def spread_of(values: np.ndarray) -> float:
+    """Standard deviation; 0 where the values are no further apart than float32 rounds them."""
+    values = np.asarray(values, np.float64)
+    if not values.size:
+        return 0.0
+    resolution = np.finfo(np.float32).eps * np.abs(values).max()
+    return float(values.std()) if np.ptp(values) > resolution else 0.0
+
+
+def relative(errors: np.ndarray, spread: float) -> np.ndarray:
+    """Errors in units of the spread; NaN where that is 0."""
+    return errors / spread if spread else np.full_like(errors, np.nan)
+
+
+def pooled(
+    reports: Mapping[str, Report], groups: Mapping[str, Sequence[str]]
+) -> dict[str, Report | Group]:
+    """One entry per group: of several runs what they are together, of a single one its report.
+
+    A run whose relative errors are NaN is left out of those of its group, and not counted.
+
+    Args:
+      reports: by name of the run.
+      groups: names of the runs of each, by what these have in common.
+
+    Returns:
+      the reports of single runs by the run's name, groups by theirs and the number of runs.
+    """
+    entries: dict[str, Report | Group] = {}
+    for group, names in groups.items():
+        if len(names) == 1:
+            entries |= {names[0]: reports[names[0]]}
+        else:
+            members = [reports[name] for name in names]
+            entries[f"{group} ({len(names)} runs)"] = pool(members)
+    return entries
+
+
+def pool(reports: Sequence[Report]) -> Group:
+    """Runs that are the units of one error by depth."""
+    of_runs = [run.by_depth for run in reports]
+    return Group(
+        ErrorByDepth(
+            states={m: np.stack([run.states[m].sum(0) for run in of_runs]) for m in MEASURES},
+            errors={m: np.stack([run.mean(m) for run in of_runs]) for m in MEASURES},
+            units="runs",
+        ),
+        spread=float(np.mean([run.spread for run in reports])),
     )
 
 
@@ -283,12 +369,16 @@ def mean_and_error(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return mean, np.sqrt(variance / np.where(count, count, np.nan))
 
 
-def rows(name: str, by_depth: ErrorByDepth) -> list[dict[str, Any]]:
-    """For a CSV: one row per depth and measure."""
+def rows(name: str, entry: Report | Group) -> list[dict[str, Any]]:
+    """For a CSV: one row per depth and measure.
+
+    The mean and its standard error are `over` episodes or runs, `count` of them.
+    """
     result = []
+    by_depth = entry.by_depth
     for measure in MEASURES:
         mean, error = mean_and_error(by_depth.errors[measure])
-        there = (~np.isnan(by_depth.errors[measure])).sum(0)
+        count, states = by_depth.number(measure), by_depth.states[measure].sum(0)
         for k in range(len(mean)):
             result.append(
                 {
@@ -297,24 +387,30 @@ def rows(name: str, by_depth: ErrorByDepth) -> list[dict[str, Any]]:
                     "depth": k,
                     "mean": float(mean[k]),
                     "standard_error": float(error[k]),
-                    "episodes": int(there[k]),
-                    "states": int(by_depth.states[measure][:, k].sum()),
+                    "over": by_depth.units,
+                    "count": int(count[k]),
+                    "states": int(states[k]),
+                    "spread": entry.spread,
                 }
             )
     return result
 
 
-def table(
-    reports: dict[str, Report], *, measures: tuple[str, ...] = ("value", "return")
-) -> str:
+SHOWN = ("value", "return", "relative_value", "relative_return")
+
+
+def table(entries: Mapping[str, Report | Group], *, measures: tuple[str, ...] = SHOWN) -> str:
     """A few depths of a few measures for people to read: mean +- standard error."""
+    wide = max(map(len, entries))
     lines = []
     for measure in measures:
-        lines.append(f"{measure} error by depth")
-        for name, run in reports.items():
-            mean, error = mean_and_error(run.by_depth.errors[measure])
+        lines.append(f"{measure.replace('_', ' ')} error by depth")
+        for name, entry in entries.items():
+            mean, error = mean_and_error(entry.by_depth.errors[measure])
             deepest = len(mean) - 1
             shown = sorted({0, 1, deepest // 4, deepest // 2, deepest})
             cells = [f"{k}: {mean[k]:.3g} +- {error[k]:.2g}" for k in shown]
-            lines.append(f"  {name:24} " + "   ".join(cells))
+            lines.append(f"  {name:{wide}}   " + "   ".join(cells))
+    lines.append("spread of V, which relative errors are relative to")
+    lines += [f"  {name:{wide}}   {entry.spread:.3g}" for name, entry in entries.items()]
     return "\n".join(lines)
