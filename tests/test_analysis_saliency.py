@@ -8,7 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import tiny
+import tiny_pixels
 import tiny_storm
+import tiny_vagram
 from analysis_records import make_episodes, make_policy
 
 from vawm import transforms
@@ -16,10 +18,11 @@ from vawm.agent import Agent, make_agent
 from vawm.analysis import episodes, saliency
 from vawm.errors import InvalidInput
 from vawm.policy import Policy
-from vawm.types import Batch, EnvSpec, Latent, image, vector
+from vawm.types import Batch, EnvSpec, Latent, vector
 
-MIXED = EnvSpec("mixed", {"a": image(48), "b": vector(2)}, 1, False, 2, 1, None)
-VECTORS = MIXED._replace(obs={"b": vector(2)})
+# As the run from pixels that test_analysis_program analyses, so that one of both compiles.
+MIXED = EnvSpec("mixed", tiny_pixels.Lamp.obs, 2, False, 2, 1, None)
+VECTORS = MIXED._replace(obs={"clock": vector(2)})
 CONTEXT, FRAMES, LENGTH, SEED = 3, 2, 6, 2
 
 
@@ -51,7 +54,10 @@ class Setting(NamedTuple):
     ids=["rssm", "storm"],
 )
 def setting(request):
-    config, spec, unit = request.param
+    return make_setting(*request.param)
+
+
+def make_setting(config, spec, unit):
     model = dataclasses.replace(config.world_model, depth=1)
     policy = make_policy(dataclasses.replace(config, world_model=model), spec)
     agent = make_agent(policy.config, spec)
@@ -113,7 +119,7 @@ def slow(setting, straight):
 
 def over_colours(squares, kind):
     """Euclidean norm, or absolute value."""
-    return np.sqrt(squares.sum(-1) if kind == "a" else squares)
+    return np.sqrt(squares.sum(-1) if kind == "picture" else squares)
 
 
 def test_the_value_map_is_the_jacobian_times_the_slope_of_the_value(setting, slow):
@@ -138,11 +144,25 @@ def test_the_sensitivity_is_the_length_of_the_jacobian_s_rows(setting, slow):
 def test_the_observed_gradient_goes_through_the_probabilities_of_z(setting, straight):
     for kind, slope in straight[0].items():
         expected = np.abs(slope)
-        if kind == "a":  # by pixels in [0, 1], over colours
+        if kind == "picture":  # by pixels in [0, 1], over colours
             expected = 255 * np.sqrt(np.square(np.asarray(slope, np.float64)).sum(-1))
         actual = np.asarray(setting.maps.observed[kind])
         np.testing.assert_allclose(actual, expected, rtol=1e-3, atol=1e-3 * expected.max())
         assert (actual > 0).any()
+
+
+def test_where_nothing_is_drawn_the_observed_gradient_is_that_of_the_value():
+    setting = make_setting(tiny_vagram.CONFIG, VECTORS, "raw")
+    steps = setting.batch.trajectory
+
+    def value(last):
+        seen = jnp.concatenate([steps.obs["clock"][:, :-1], last[:, None]], axis=1)
+        moved = steps._replace(obs={"clock": seen})
+        return setting.value(setting.follow(setting.batch._replace(trajectory=moved))).sum()
+
+    slope = jax.jit(jax.grad(value))(steps.obs["clock"][:, -1])
+    np.testing.assert_allclose(setting.maps.observed["clock"], abs(slope), rtol=1e-4)
+    assert (setting.maps.observed["clock"] > 0).all()
 
 
 def test_the_value_is_in_its_unit(setting, straight):
@@ -151,14 +171,16 @@ def test_the_value_is_in_its_unit(setting, straight):
 
 def test_a_look_at_an_episode_is_evenly_spaced(setting):
     policy, _, data, *_ = setting
-    if "a" in data.trajectory.obs:
+    if "picture" in data.trajectory.obs:
         return  # the same, for more work
     choices = {"context": CONTEXT, "frames": FRAMES, "seed": SEED, "unit": setting.unit}
     look = saliency.look(policy, data, **choices)
     assert look.step.tolist() == [2, 5]
     # The same windows and the same key as the maps have.
-    np.testing.assert_array_equal(look.saliency.value["b"], setting.maps.value["b"])
-    np.testing.assert_array_equal(look.truth["b"], data.trajectory.obs["b"][0, look.step])
+    np.testing.assert_array_equal(look.saliency.value["clock"], setting.maps.value["clock"])
+    np.testing.assert_array_equal(
+        look.truth["clock"], data.trajectory.obs["clock"][0, look.step]
+    )
     assert saliency.coordinates(look.truth, look.saliency.observed).shape == (2, 2)
 
 
@@ -166,12 +188,12 @@ def test_rows_are_of_images_and_of_coordinates(setting):
     truth = jax.tree.map(lambda x: x[:, -1], setting.batch.trajectory.obs)
     look = saliency.Look(np.array([2, 5]), *jax.device_get((truth, setting.maps)), "raw")
     rows = {(row["map"], row["what"]): row["value"] for row in saliency.rows("run", look)}
-    expected = np.mean(setting.maps.observed["b"][:, 1])
-    assert rows["observed", "coordinate 1"] == pytest.approx(expected)
-    if "a" in truth:
+    expected = np.mean(setting.maps.observed["clock"][:, 0])
+    assert rows["observed", "coordinate 0"] == pytest.approx(expected)
+    if "picture" in truth:
         for kind in saliency.MAPS:
             pixels = saliency.images(look.truth, getattr(look.saliency, kind))
-            np.testing.assert_array_equal(pixels, getattr(setting.maps, kind)["a"])
+            np.testing.assert_array_equal(pixels, getattr(setting.maps, kind)["picture"])
             assert rows[kind, "concentration"] == saliency.concentration(pixels)
 
 

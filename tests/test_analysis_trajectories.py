@@ -6,6 +6,7 @@ import sys
 import numpy as np
 import pytest
 import tiny
+import tiny_vagram
 from analysis_records import make_episodes, make_policy
 
 from vawm.analysis import movies, trajectories
@@ -15,29 +16,31 @@ from vawm.runner import RunError
 from vawm.transforms import symlog
 
 
-@pytest.fixture(scope="module")
-def played():
-    policy = make_policy(tiny.CONFIG, tiny.env().spec)
+@pytest.fixture(
+    scope="module", params=[tiny.CONFIG, tiny_vagram.CONFIG], ids=["rssm", "vagram"]
+)
+def played(request):
+    policy = make_policy(request.param, tiny.env().spec)
     return policy, make_episodes(policy, episodes=3, length=10)
 
 
 def test_a_window_is_one_of_the_episode(played):
     policy, record = played
-    found = trajectories.imagine(policy, record, context=2, depth=4, seed=3, at_most=2)
-    assert found.predicted.shape == found.truth.shape == (2, 6, 2)
+    found = trajectories.imagine(policy, record, context=3, depth=4, seed=3, at_most=2)
+    assert found.predicted.shape == found.truth.shape == (2, 7, 2)
     assert found.inside.all()
     for row, start in enumerate(found.start):
-        assert 1 <= start <= 4
-        seen = record.trajectory.obs[row, start : start + 6]
+        assert 1 <= start <= 3
+        seen = record.trajectory.obs[row, start : start + 7]
         np.testing.assert_array_equal(found.truth[row], seen)
 
 
 def test_a_window_longer_than_the_episode_says_what_is_inside(played):
     policy, record = played
     short = record._replace(length=np.array([4, 6, 10]))
-    found = trajectories.imagine(policy, short, context=2, depth=4, seed=0, at_most=2)
+    found = trajectories.imagine(policy, short, context=3, depth=4, seed=0, at_most=2)
     np.testing.assert_array_equal(found.start, [1, 1])
-    assert found.inside.tolist() == [3 * [True] + 3 * [False], 5 * [True] + [False]]
+    assert found.inside.tolist() == [3 * [True] + 4 * [False], 5 * [True] + 2 * [False]]
 
 
 def hand():
