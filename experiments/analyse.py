@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import pathlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -201,7 +201,7 @@ def show_saliency(options: Options, played: Sequence[Played]) -> None:
 
 
 def show_values(options: Options, played: Sequence[Played]) -> None:
-    """Prints a table of what it found, and which groups it pooled at different steps."""
+    """Prints a table of what it found, and which groups are uneven."""
     reports = {
         name: values.report(
             policy, record, context=options.context, depth=options.depth, seed=options.seed
@@ -219,10 +219,22 @@ def show_values(options: Options, played: Sequence[Played]) -> None:
     for name, report in reports.items():
         figures.values(name, report, options.output / f"values_{name}.png")
     print(values.table(entries))
+    for line in uneven(groups):
+        print(line)
+
+
+def uneven(groups: Mapping[str, Sequence[Played]]) -> list[str]:
+    """Names the groups whose runs were trained for different lengths.
+
+    A run may exceed its steps by a few, so a hundredth more or less is no difference.
+    """
+    lines = []
     for group, runs in groups.items():
         steps = sorted({run.policy.env_steps for run in runs})
-        if len(steps) > 1:
-            print(f"{group}: its runs are at {', '.join(map(str, steps))} environment steps")
+        if steps[-1] - steps[0] > steps[-1] / 100:
+            listed = ", ".join(map(str, steps))
+            lines.append(f"{group}: its runs are at {listed} environment steps")
+    return lines
 
 
 def play(options: Options, loaded: Loaded) -> list[Played]:

@@ -230,6 +230,17 @@ def test_one_plays_for_all(run, second, vagram, offline, judged, drawn, tmp_path
     assert f"{groups[0]}: its runs are at 8, 16 environment steps" in output
 
 
+def test_a_group_is_uneven_if_its_runs_differ_by_more_than_they_exceed_their_length():
+    policy = make_policy(tiny.CONFIG, tiny.env().spec)
+
+    def at(*steps):
+        return [analyse.Played("a", policy._replace(env_steps=n), None) for n in steps]
+
+    groups = {"alike": at(1000, 1010), "apart": at(1000, 1011, 500), "one": at(7)}
+    expected = ["apart: its runs are at 500, 1000, 1011 environment steps"]
+    assert analyse.uneven(groups) == expected
+
+
 @pytest.fixture(scope="module")
 def pixels(folder):
     """The folder of a run from pixels, and episodes that its policy has played."""
