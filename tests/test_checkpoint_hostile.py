@@ -205,7 +205,14 @@ def test_a_field_that_is_missing_or_of_another_kind_is_refused(path, field):
     ("change", "match"),
     [
         (lambda c: c.update(more=1), "'more' is not known"),
-        (lambda c: c.update(schema=2, version="9.9"), "was written by vawm 9.9, whose layout"),
+        (
+            lambda c: c.update(schema=2, version="9.9"),
+            "its layout is not known; vawm 9.9 wrote it and this is vawm .*: use the version",
+        ),
+        (
+            lambda c: c["config"].update(colour=1) or c.update(version="9.9"),
+            r"run/checkpoints/0.*': Config\.colour=1: is not known; vawm 9.9 wrote .* --fresh",
+        ),
         (lambda c: c.update(env_steps=-1), "-1 is not a count|'-1' is not a count"),
         (lambda c: c["config"].update(colour=1), r"Config\.colour=1: is not known"),
         (lambda c: c["config"].pop("seed"), r"Config\.seed=None: was not saved"),

@@ -271,9 +271,20 @@ def flip(data):
         ("config.json", lambda data: b"[]", "is no description of a policy"),
         ("config.json", lambda data: b"\xff\xfe", "is no description of a policy"),
         ("config.json", None, "is no description of a policy .No such file"),
-        ("config.json", lambda data: data.replace(b'"schema": 1', b'"schema": 2'), "layout"),
+        ("config.json", lambda data: b"[" * 200_000, "is no description of a policy"),
+        ("config.json", lambda data: data + b" " * 2**24, "more than the 16777216 bytes"),
+        ("config.json", lambda data: data.replace(b": 32,", b": Infinity,"), "OverflowError"),
+        (
+            "config.json",
+            lambda data: data.replace(b'"schema": 1', b'"schema": 2'),
+            "its layout is not known; vawm .* wrote it .* or export it again",
+        ),
         ("config.json", lambda data: data.replace(b'"seed": 0', b'"seed": -1'), "seed=-1"),
-        ("config.json", lambda data: data.replace(b'"seed"', b'"sede"'), "other version"),
+        (
+            "config.json",
+            lambda data: data.replace(b'"seed"', b'"sede"'),
+            "sede=0: is not known; vawm",
+        ),
         ("config.json", lambda data: data.replace(b'"obs"', b'"abs"'), "obs is missing"),
     ],
 )

@@ -3,8 +3,10 @@
 import errno
 import json
 import os
+import pathlib
 import subprocess
 import sys
+import tempfile
 
 import pytest
 import tiny
@@ -37,11 +39,30 @@ def test_a_path_through_a_file_is_refused(tmp_path, below):
         rundir.check_new(tmp_path / "file" / below)
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
-def test_a_folder_without_permission_is_refused(tmp_path):
-    tmp_path.chmod(0o500)
-    with pytest.raises(InvalidInput, match="is not writable"):
-        rundir.check_new(tmp_path / "run")
+@pytest.fixture
+def nobody():
+    """The user of the test is not root, who may write everywhere."""
+    if os.geteuid():
+        yield
+        return
+    try:
+        os.setresuid(65534, 65534, 0)
+    except OSError:
+        pytest.skip("root may write everywhere, and may not be another user")
+    try:
+        yield
+    finally:
+        os.setresuid(0, 0, 0)
+
+
+def test_a_folder_without_permission_is_refused(nobody):
+    with tempfile.TemporaryDirectory() as folder:  # pytest's own are hidden from others
+        os.chmod(folder, 0o500)
+        for logdir in (pathlib.Path(folder), pathlib.Path(folder, "run")):
+            with pytest.raises(InvalidInput, match="is not writable"):
+                rundir.check_new(logdir)
+        os.chmod(folder, 0o700)
+        rundir.check_new(pathlib.Path(folder, "run"))
 
 
 def test_a_second_claim_is_refused_and_names_the_holder(tmp_path):
@@ -72,6 +93,20 @@ def test_the_config_is_written_with_the_version(tmp_path):
     assert content["vawm"] == manifest.version()
     assert rundir.read_config(tmp_path) == tiny.CONFIG
     assert rundir.read_config(tmp_path / "nowhere") is None
+
+
+def test_a_config_of_another_version_says_which_and_what_to_do(tmp_path):
+    rundir.write_config(tmp_path, tiny.CONFIG)
+    path = tmp_path / "config.json"
+    content = json.loads(path.read_text()) | {"vawm": "9.9"}
+    content["config"]["colour"] = 1
+    path.write_text(json.dumps(content))
+    with pytest.raises(InvalidInput) as error:
+        rundir.read_config(tmp_path)
+    assert str(error.value) == (
+        f"logdir='{path}': Config.colour=1: is not known; vawm 9.9 wrote it and this is vawm "
+        f"{manifest.version()}: use the version that wrote it, or start over with --fresh"
+    )
 
 
 def test_a_config_that_cannot_be_written_leaves_the_folder_as_it_was(tmp_path, monkeypatch):

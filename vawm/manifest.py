@@ -54,6 +54,25 @@ class Damaged(InvalidInput):
         self.path, self.how = path, how
 
 
+class OtherVersion(InvalidInput):
+    """What another version wrote: `why` this one cannot use it, and what can be done."""
+
+    def __init__(
+        self,
+        field: str,
+        where: pathlib.Path,
+        why: object,
+        *,
+        written: object,
+        otherwise: str = "start over with --fresh",
+    ):
+        remedy = (
+            f"{why}; vawm {str(written)[:40]} wrote it and this is vawm {version()}: use the "
+            f"version that wrote it, or {otherwise}"
+        )
+        super().__init__(field, str(where), remedy)
+
+
 class LeafInfo(NamedTuple):
     """What a leaf has to look like; `impl` names the generator of a typed PRNG key."""
 
@@ -127,16 +146,15 @@ def config_from_dict(content: dict[str, Any], cls: type = Config) -> Any:
     """The inverse of `config.as_dict`.
 
     Raises:
-      InvalidInput: a field is missing or unknown, as after a change of version.
+      InvalidInput: a field is missing or unknown, as after a change of version. The caller
+        knows which, and raises `OtherVersion`.
     """
     if not isinstance(content, dict):
         raise InvalidInput(cls.__name__, str(content)[:40], "holds no choices")
     names = {field.name for field in dataclasses.fields(cls)}
     for name in sorted(names ^ content.keys()):
         verb = "was not saved" if name in names else "is not known"
-        raise InvalidInput(
-            f"{cls.__name__}.{name[:40]}", content.get(name), f"{verb} (other version)"
-        )
+        raise InvalidInput(f"{cls.__name__}.{name[:40]}", content.get(name), verb)
     hints = dict(config_lib.kinds(cls))
     if cls is Config:
         for name, known in (
@@ -144,9 +162,7 @@ def config_from_dict(content: dict[str, Any], cls: type = Config) -> Any:
             ("agent", config_lib.AGENT_CONFIGS),
         ):
             if not isinstance(content[name], str) or content[name] not in known:
-                raise InvalidInput(
-                    f"Config.{name}", content[name], "is not known (other version)"
-                )
+                raise InvalidInput(f"Config.{name}", content[name], "is not known")
         hints["env"] = config_lib.ENV_CONFIGS[content["suite"]]
         hints |= config_lib.AGENT_CONFIGS[content["agent"]]._asdict()
     return cls(
@@ -163,7 +179,7 @@ def _choice(name: str, value: Any, hint: Any) -> Any:
     """`value`, of the kind that the field has; what it may be is for `validate`."""
     kinds = {float: (int, float)}.get(hint, (hint,) if isinstance(hint, type) else (str,))
     if not isinstance(value, kinds) or (isinstance(value, bool) and hint is not bool):
-        raise InvalidInput(name, str(value)[:40], "is of another kind (other version)")
+        raise InvalidInput(name, str(value)[:40], "is of another kind")
     return value
 
 
@@ -192,8 +208,8 @@ def write(folder: pathlib.Path, manifest: Manifest) -> int:
     digest = hashlib.sha256(text).hexdigest().encode() + b"\n"
     (folder / NAME).write_bytes(text)
     (folder / DIGEST).write_bytes(digest)
-    for path in (*found, folder / NAME, folder / DIGEST):
-        _sync(path)
+    for path in (*folder.rglob("*"), folder):
+        sync(path)
     return sum(sizes.values()) + len(text) + len(digest)
 
 
@@ -203,10 +219,13 @@ def sha256(path: pathlib.Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _sync(path: pathlib.Path) -> None:
-    """Returns when a file is on the disk, not in a buffer."""
-    with path.open("rb") as file:
-        os.fsync(file.fileno())
+def sync(path: pathlib.Path) -> None:
+    """Returns when a file, or the names in a folder, are on the disk and not in a buffer."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def read(folder: pathlib.Path) -> Manifest:
@@ -214,7 +233,7 @@ def read(folder: pathlib.Path) -> Manifest:
 
     Raises:
       Damaged: it is missing, changed, too large, or describes no checkpoint of ours.
-      InvalidInput: another version wrote it, or its config could not be run.
+      OtherVersion: its layout or a choice is not known, or could not be run.
     """
     digest, text = _content(folder / DIGEST, 1024), _content(folder / NAME, MAX_BYTES)
     if not re.fullmatch(rb"[0-9a-f]{64}\n", digest):
@@ -224,16 +243,18 @@ def read(folder: pathlib.Path) -> Manifest:
     try:
         content = _record(json.loads(text), {"schema": int, "version": str}, whole=False)
         if content["schema"] != SCHEMA:
-            written = content["version"][:40]
-            remedy = f"was written by vawm {written}, whose layout this one cannot read"
-            raise InvalidInput("checkpoint", str(folder), remedy)
+            why, written = "its layout is not known", content["version"]
+            raise OtherVersion("checkpoint", folder, why, written=written)
         manifest = _parse(content)
-    except InvalidInput:
+        validate.check(manifest.config)
+    except OtherVersion:
         raise
+    except InvalidInput as error:
+        written = content["version"]
+        raise OtherVersion("checkpoint", folder, error, written=written) from error
     except (ValueError, TypeError, RecursionError) as error:
         reason = "nested too deep" if isinstance(error, RecursionError) else _first_line(error)
         raise Damaged(folder / NAME, f"is not a manifest: {reason}") from error
-    validate.check(manifest.config)
     return manifest
 
 

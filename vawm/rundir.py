@@ -101,15 +101,20 @@ def read_config(logdir: pathlib.Path) -> Config | None:
     """What `write_config` wrote into `logdir`; None where no run was started.
 
     Raises:
-      InvalidInput: another version wrote it, with other fields.
+      OtherVersion: it has other choices than this one knows.
     """
+    path = logdir / CONFIG
     try:
-        content = json.loads((logdir / CONFIG).read_text())
+        content = json.loads(path.read_text())
     except (OSError, ValueError, RecursionError):
         return None
     if not isinstance(content, dict) or not {"schema", "vawm", "config"} <= content.keys():
         return None
-    return manifest_lib.config_from_dict(content["config"])
+    try:
+        return manifest_lib.config_from_dict(content["config"])
+    except InvalidInput as error:
+        written = content["vawm"]
+        raise manifest_lib.OtherVersion("logdir", path, error, written=written) from error
 
 
 def put_aside(logdir: pathlib.Path) -> pathlib.Path | None:

@@ -50,6 +50,15 @@ DTYPES = {
     "F64": "float64",
 }
 """What safetensors calls a dtype -> what numpy does."""
+MAX_BYTES = 2**24
+"""Of `config.json`; that of a policy has a few thousand."""
+
+
+WRONG = (
+    *(OSError, ValueError, TypeError, KeyError, AttributeError),
+    *(OverflowError, RecursionError),  # numbers without end, and nesting
+)
+"""What is raised by content that is no description."""
 
 
 class Description(NamedTuple):
@@ -73,13 +82,12 @@ class Description(NamedTuple):
 def found(folder: str | os.PathLike[str]) -> bool:
     """Whether `folder` is, or was, one that `write` wrote, and not that of a run."""
     folder = pathlib.Path(folder).expanduser()
-    if (folder / MODEL).is_file():
+    if os.path.isfile(folder / MODEL):  # False too where it may not be looked at
         return True
     try:
-        content = json.loads((folder / CONFIG).read_text())
-    except (OSError, ValueError):
+        return bool(_content(folder / CONFIG))
+    except WRONG:
         return False
-    return isinstance(content, dict) and content.get("format") == FORMAT
 
 
 def check_output(folder: pathlib.Path) -> None:
@@ -129,8 +137,8 @@ def write(
         (scratch / CONFIG).write_text(json.dumps(content, indent=2) + "\n")
         (scratch / CARD).write_text(card)
         (scratch / MODEL).chmod((scratch / CARD).stat().st_mode)  # the library's is 0600
-        for name in (CONFIG, CARD):
-            manifest_lib.sha256(scratch / name)  # on the disk when this returns
+        for path in (*scratch.iterdir(), scratch):
+            manifest_lib.sync(path)
         scratch.replace(folder.absolute())
     except (OSError, safetensors.SafetensorError) as error:
         shutil.rmtree(scratch, ignore_errors=True)
@@ -141,31 +149,43 @@ def describe(folder: str | os.PathLike[str]) -> Description:
     """What `config.json` in `folder` says.
 
     Raises:
-      InvalidInput: it is damaged, of another version, or could not be run.
+      InvalidInput: it is damaged, or another version wrote it (`OtherVersion`).
     """
     path = pathlib.Path(folder).expanduser() / CONFIG
     try:
-        content = json.loads(path.read_text())
-        if content["format"] != FORMAT:
-            raise ValueError(f"format is {content['format']!r}")
+        content = _content(path)
+        written = content["vawm"]
         if content["schema"] != SCHEMA:
-            remedy = f"was written by vawm {content['vawm']}, whose layout this one cannot read"
-            raise InvalidInput("folder", str(path), remedy)
+            raise InvalidInput("schema", content["schema"], "its layout is not known")
         description = Description(
-            version=str(content["vawm"]),
+            version=str(written),
             env_steps=int(content["env_steps"]),
             config=manifest_lib.config_from_dict(content["config"]),
             spec=manifest_lib.spec_from_dict(content["spec"]),
             sha256=content["sha256"],
         )
-    except InvalidInput:
-        raise
-    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+        validate.check(description.config)
+        validate.check_spec(description.config, description.spec)
+        return description
+    except InvalidInput as error:
+        raise manifest_lib.OtherVersion(
+            "weights", path, error, written=written, otherwise="export it again"
+        ) from error
+    except WRONG as error:
         reason = error.strerror if isinstance(error, OSError) else repr(error)[:200]
         raise _damaged(path, f"is no description of a policy ({reason})") from error
-    validate.check(description.config)
-    validate.check_spec(description.config, description.spec)
-    return description
+
+
+def _content(path: pathlib.Path) -> dict[str, Any]:
+    """What is in `config.json`, of this format; an error of `WRONG` where it is none."""
+    with path.open("rb") as file:
+        text = file.read(MAX_BYTES + 1)
+    if len(text) > MAX_BYTES:
+        raise ValueError(f"more than the {MAX_BYTES} bytes allowed")
+    content = json.loads(text)
+    if content["format"] != FORMAT:
+        raise ValueError(f"format is {str(content['format'])[:40]!r}")
+    return content
 
 
 def read(
