@@ -3,6 +3,7 @@
 import errno
 import gc
 import logging
+import re
 import resource
 import shutil
 from typing import Any, NamedTuple
@@ -189,11 +190,25 @@ def test_a_full_disk_leaves_the_previous_checkpoint_alone(tmp_path, monkeypatch)
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(manifest, "write", full)
-    with pytest.raises(checkpoint.SaveError, match=r"MiB needed, .* MiB free.*No space left"):
+    with pytest.raises(
+        checkpoint.SaveError, match=r"needed, .* free\): .*No space left"
+    ) as error:
         save(tmp_path, toy.state(1), 16)
+    assert re.search(r"\(up to \d+ B needed, [\d.]+ [KMG]iB free\)", str(error.value))
+    assert str(error.value).endswith(
+        "kept: the checkpoint at 8; put that right, then go on with --resume"
+    )
     monkeypatch.undo()
     assert list(checkpoint.root(tmp_path).iterdir()) == [first]
     toy.assert_equal(checkpoint.restore(tmp_path, toy.state())[0], toy.state())
+
+
+@pytest.mark.parametrize(
+    ("nbytes", "text"),
+    [(0, "0 B"), (337, "337 B"), (1024, "1.0 KiB"), (1_600_000, "1.5 MiB"), (2**35, "32 GiB")],
+)
+def test_bytes_are_told_in_a_unit_that_suits_them(nbytes, text):
+    assert checkpoint.writing.amount(nbytes) == text
 
 
 # TensorStore may still want to tell the loop that Orbax has closed.
@@ -207,7 +222,7 @@ def test_what_cannot_be_written_is_one_error_and_no_pages_of_traces(tmp_path, ca
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
     try:
         with pytest.raises(
-            checkpoint.SaveError, match=r"MiB free\): .* File too large$"
+            checkpoint.SaveError, match=r"iB free\): .* File too large; kept: "
         ) as error:
             save_toy(tmp_path, large, 16)
     finally:

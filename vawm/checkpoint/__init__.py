@@ -21,7 +21,15 @@ are stored flat, named by their path in the tree; typed PRNG keys are stored as 
 and empty arrays, which Orbax refuses, in the manifest alone. Nothing is ever unpickled.
 """
 
-from vawm.checkpoint.folders import DAMAGED, SCRATCH, complete, latest, root, set_aside
+from vawm.checkpoint.folders import (
+    DAMAGED,
+    SCRATCH,
+    complete,
+    kept,
+    latest,
+    root,
+    set_aside,
+)
 from vawm.checkpoint.leaves import flatten, unflatten
 from vawm.checkpoint.reading import (
     ACTING,
@@ -53,6 +61,7 @@ __all__ = [
     "complete",
     "find",
     "flatten",
+    "kept",
     "latest",
     "read_agent",
     "read_episodes",

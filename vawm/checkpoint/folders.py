@@ -6,6 +6,8 @@ import os
 import pathlib
 import shutil
 
+from vawm.errors import InvalidInput
+
 SCRATCH, DAMAGED = "tmp-", "damaged-"
 """What the names begin with of one that is not complete, and of one that was set aside."""
 
@@ -21,11 +23,21 @@ def folder(logdir: str | os.PathLike[str], env_steps: int) -> pathlib.Path:
 
 
 def complete(logdir: str | os.PathLike[str]) -> list[pathlib.Path]:
-    """All that have been completed, the newest first; whether they are whole is not asked."""
-    if not root(logdir).is_dir():
+    """All that have been completed, the newest first; whether they are whole is not asked.
+
+    Raises:
+      InvalidInput: nobody here may look into the folder.
+    """
+    folder = root(logdir)
+    try:
+        names = [name for name in os.listdir(folder) if _is_step(name)]
+    except (FileNotFoundError, NotADirectoryError):
         return []
-    named = [path for path in root(logdir).iterdir() if _is_step(path.name)]
-    return sorted(named, key=lambda path: int(path.name), reverse=True)
+    except PermissionError as error:
+        raise InvalidInput(
+            "logdir", str(logdir), f"cannot be read ({error.strerror})"
+        ) from error
+    return [folder / name for name in sorted(names, key=int, reverse=True)]
 
 
 def _is_step(name: str) -> bool:
@@ -35,6 +47,12 @@ def _is_step(name: str) -> bool:
 def latest(logdir: str | os.PathLike[str]) -> pathlib.Path | None:
     """The newest complete checkpoint, or None; `find` tells whether it is whole."""
     return next(iter(complete(logdir)), None)
+
+
+def kept(logdir: str | os.PathLike[str]) -> str:
+    """What there is to go on from, for a message."""
+    newest = latest(logdir)
+    return f"the checkpoint at {int(newest.name)}" if newest else "no checkpoint yet"
 
 
 def set_aside(path: pathlib.Path) -> pathlib.Path:
@@ -63,12 +81,3 @@ def prune(logdir: str | os.PathLike[str], keep: int) -> None:
             continue
     for path in root(logdir).glob(SCRATCH + "*"):
         shutil.rmtree(path, ignore_errors=True)
-
-
-def sync(path: pathlib.Path) -> None:
-    """Returns when the names in a folder are on the disk."""
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -80,10 +80,10 @@ def write(logdir: str | os.PathLike[str], taken: Snapshot) -> Written:
                 arrays.write(scratch / item, taken.arrays[item])
             nbytes = manifest_lib.write(scratch, _manifest(taken))
             scratch.rename(final)
-            folders.sync(final.parent)
+            manifest_lib.sync(final.parent)
         except Exception as error:
             shutil.rmtree(scratch, ignore_errors=True)
-            raise SaveError(_why_not_saved(final, taken.nbytes, error)) from error
+            raise SaveError(_why_not_saved(logdir, final, taken.nbytes, error)) from error
         finally:
             gc.collect(1)  # Orbax leaves young cycles that hold all of it, compressed
     folders.prune(logdir, taken.config.keep_checkpoints)
@@ -120,15 +120,34 @@ def _refuse_nonfinite(needed: Mapping[str, np.ndarray]) -> None:
     """What acting needs has to be finite."""
     for path, array in needed.items():
         if not np.isfinite(array).all():
-            raise SaveError(f"parameter {path} is not finite; no checkpoint is written")
+            raise SaveError(
+                f"parameter {path} is not finite, so no checkpoint is written; start again "
+                "with a smaller --optimizer.learning-rate or another --seed"
+            )
 
 
-def _why_not_saved(final: pathlib.Path, needed: int, error: Exception) -> str:
-    free = shutil.disk_usage(final.parents[1]).free
+def _why_not_saved(
+    logdir: str | os.PathLike[str], final: pathlib.Path, needed: int, error: Exception
+) -> str:
     reason = (str(error).strip() or repr(error)).splitlines()[0]
     # TensorStore names file after file before what the system said, and its choices after.
     reason = re.split(r" \[\w+='", reason)[0].rpartition('": ')[-1]
+    try:
+        free = amount(shutil.disk_usage(final.parents[1]).free)
+    except OSError:
+        free = "an unknown amount"
     return (
-        f"checkpoint {final} could not be written (up to {needed / 2**20:.0f} MiB needed, "
-        f"{free / 2**20:.0f} MiB free): {reason[:200]}"
+        f"checkpoint {final} could not be written (up to {amount(needed)} needed, {free} "
+        f"free): {reason[:200]}; kept: {folders.kept(logdir)}; put that right, then go on "
+        "with --resume"
     )
+
+
+def amount(nbytes: int) -> str:
+    """Bytes for people: `"337 B"`, `"1.5 MiB"`, `"57 GiB"`."""
+    size, units = float(nbytes), ["B", "KiB", "MiB", "GiB"]
+    while size >= 1024 and len(units) > 1:
+        size /= 1024
+        del units[0]
+    digits = 1 if size < 10 and units[0] != "B" else 0
+    return f"{size:.{digits}f} {units[0]}"
