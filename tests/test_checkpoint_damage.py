@@ -1,5 +1,7 @@
 """Damaged checkpoints: named, passed over with a warning, and never read as something else."""
 
+import errno
+import os
 import random
 import shutil
 
@@ -103,6 +105,20 @@ def test_if_none_is_whole_the_first_damaged_file_is_named_and_nothing_changed(lo
     assert {file: file.read_bytes() for file in files_of(logdir)} == before
 
 
+def test_one_that_its_run_deletes_while_it_is_read_is_not_damaged(logdir, monkeypatch):
+    verify = checkpoint.reading.verify
+
+    def meanwhile(folder, *arguments):
+        if folder.name == "000000000016":
+            for env_steps in (24, 32):
+                save_toy(logdir, toy.state(env_steps), env_steps)
+        verify(folder, *arguments)
+
+    monkeypatch.setattr(checkpoint.reading, "verify", meanwhile)
+    found = checkpoint.find(logdir)
+    assert (found.path.name, found.damaged) == ("000000000032", ())
+
+
 def test_an_empty_folder_is_passed_over(logdir):
     empty = checkpoint.root(logdir) / "000000000024"
     empty.mkdir()
@@ -117,6 +133,15 @@ def test_what_is_not_complete_is_no_checkpoint(saved, tmp_path, names):
         shutil.copytree(checkpoint.latest(saved), tmp_path / "checkpoints" / name)
     with pytest.raises(InvalidInput, match="holds no checkpoint"):
         checkpoint.find(tmp_path)
+
+
+def test_a_folder_that_may_not_be_read_is_one_line(logdir, monkeypatch):
+    def refuse(_):
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(os, "listdir", refuse)
+    with pytest.raises(InvalidInput, match=r"logdir=.*: cannot be read \(Permission denied\)"):
+        policy.load(logdir)
 
 
 def test_only_empty_folders_are_no_reason_to_start_over(tmp_path):

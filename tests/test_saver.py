@@ -103,7 +103,9 @@ def test_a_full_disk_is_heard_of_at_the_next_call(tmp_path, monkeypatch, call):
     again = {"state": toy.state(), "env_steps": 16, "progress": {}} if call == "save" else {}
     with saver(tmp_path) as saving:
         begin_and_fail(saving, monkeypatch)
-        with pytest.raises(checkpoint.SaveError, match=r"MiB free\): .*No space left") as error:
+        with pytest.raises(
+            checkpoint.SaveError, match=r"[KMG]iB free\): .*No space left"
+        ) as error:
             getattr(saving, call)(**again)
         assert "\n" not in str(error.value)
         assert list(checkpoint.root(tmp_path).iterdir()) == [before]
@@ -143,6 +145,18 @@ def test_going_backwards_is_refused_before_anything_is_copied(tmp_path, env_step
         with pytest.raises(checkpoint.SaveError, match="does not go backwards"):
             saving.save(toy.state(), env_steps=env_steps, progress={})
         saving.wait()
+
+
+def test_the_folder_of_a_run_is_not_made_again(tmp_path):
+    logdir = tmp_path / "run"
+    logdir.mkdir()
+    with saver(logdir) as saving:
+        saving.save(toy.state(), env_steps=8, progress={})
+        saving.wait()
+        moved = logdir.rename(tmp_path / "moved")
+        with pytest.raises(checkpoint.SaveError, match="is gone, so no checkpoint is written"):
+            saving.save(toy.state(), env_steps=16, progress={})
+    assert list(tmp_path.iterdir()) == [moved]
 
 
 def test_time_is_counted_from_the_save_before(tmp_path, monkeypatch):

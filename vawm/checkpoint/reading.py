@@ -56,6 +56,8 @@ def find(logdir: str | os.PathLike[str], items: Collection[str] | None = None) -
             manifest = manifest_lib.read(path)
             verify(path, manifest, manifest.leaves if items is None else items)
         except Damaged as error:
+            if path not in folders.complete(logdir):  # its run goes on, and deletes old ones
+                return find(logdir, items)
             damaged.append((path, error))
         else:
             return Found(path, manifest, tuple(damaged))

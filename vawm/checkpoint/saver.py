@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vawm.checkpoint import snapshot, writing
+from vawm.checkpoint import folders, snapshot, writing
 from vawm.checkpoint.snapshot import Snapshot
 from vawm.checkpoint.writing import SaveError, Written
 from vawm.config import Config
@@ -43,9 +43,9 @@ class Saver:
       logdir: the folder of the run.
       config: of the run; `save_minutes` counts from here, and from each save on.
       spec: of the environment.
-      log: takes a line about each complete checkpoint: `checkpoint/bytes` on the disk,
-        `checkpoint/seconds` until it was complete, `checkpoint/blocked_seconds` of those in
-        which the caller waited.
+      log: takes a line about each complete checkpoint, once the caller hears of it:
+        `checkpoint/bytes` of its files, `checkpoint/seconds` until it was complete and older
+        ones were deleted, `checkpoint/blocked_seconds` of those in which the caller waited.
     """
 
     def __init__(
@@ -77,10 +77,16 @@ class Saver:
         """Waits for the save before, copies the state, and has it written behind the caller.
 
         Raises:
-          SaveError: the save before failed, or there is a checkpoint as new as this.
+          SaveError: the save before failed, there is a checkpoint as new as this, or the
+            folder of the run is gone.
         """
         self.wait()
         began = time.monotonic()
+        if not folders.root(self.logdir).parent.is_dir():  # nobody would look for a new one
+            raise SaveError(
+                f"{self.logdir} is gone, so no checkpoint is written; if it was moved, go on "
+                "with --resume where it is"
+            )
         writing.refuse_backwards(self.logdir, env_steps)
         taken = snapshot.take(
             state,
