@@ -9,7 +9,7 @@ import pytest
 import tiny
 import toy
 
-from vawm import checkpoint, replay, resume, rundir
+from vawm import checkpoint, replay, resume, rundir, tracking
 from vawm.errors import InvalidInput
 from vawm.types import Latent, Trajectory
 
@@ -116,6 +116,44 @@ def test_a_run_whose_checkpoints_are_gone_is_not_started_over(tmp_path, reached,
         resume.check(str(tmp_path), tiny.config(env_steps=10_000, save_every=5_000))
     assert error.value.field == "logdir"
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_a_run_that_saved_by_the_clock_is_not_started_over_either(tmp_path):
+    """Long before the first checkpoint that is due by its steps."""
+    started(tmp_path, 16)
+    (tmp_path / "checkpoints.jsonl").write_text('{"env_steps": 24}\n')
+    with pytest.raises(InvalidInput, match=r"checkpoints are gone.* 24 env steps"):
+        resume.check(tmp_path, tiny.config(env_steps=10_000))
+
+
+def with_lines(logdir, *written, name="metrics.jsonl"):
+    """A file of lines at these env steps; None is a damaged one."""
+    texts = ["damaged" if x is None else f'{{"env_steps": {x}}}' for x in written]
+    (logdir / name).write_text("".join(text + "\n" for text in texts))
+
+
+@pytest.mark.parametrize(
+    ("written", "warning"),
+    [
+        ((16, 32, 48), None),
+        ((16, 32), None),
+        ((16, None, 32, 48), "1 damaged lines of metrics.jsonl are left out"),
+        ((16, 32, None), None),
+        ((16,), "metrics.jsonl ends at 16 env steps and the checkpoint goes on from 32: "),
+        ((), "metrics.jsonl ends at 0 env steps and the checkpoint goes on from 32: "),
+    ],
+)
+def test_lines_that_are_missing_from_what_a_run_goes_on_from_are_told(
+    tmp_path, written, warning
+):
+    with_lines(tmp_path, *written)
+    with_lines(tmp_path, 16, 40, 48, name="checkpoints.jsonl")
+    told = resume.cut_back(tmp_path, env_steps=40, logged=32)
+    assert bool(told) == bool(warning)
+    assert (told or "").startswith(warning or "")
+    for name, last in (("metrics.jsonl", 32), ("checkpoints.jsonl", 40)):
+        assert all(line["env_steps"] <= last for line in tracking.read(tmp_path / name))
+    assert len(tracking.read(tmp_path / "checkpoints.jsonl")) == 2
 
 
 def test_a_width_that_differs_is_named_rather_than_the_size_custom(saved):

@@ -145,7 +145,7 @@ def test_a_tracker_that_fails_changes_nothing_but_one_line_of_output(
 
 
 def saves(logdir):
-    return [line["env_steps"] for line in tracking.read(logdir / runner.SAVE_LINES)]
+    return [line["env_steps"] for line in tracking.read(logdir / tracking.SAVE_LINES)]
 
 
 def test_a_line_tells_of_each_checkpoint(tmp_path, fake):
@@ -153,7 +153,7 @@ def test_a_line_tells_of_each_checkpoint(tmp_path, fake):
     run(tiny.CONFIG, tmp_path)
     names = {"checkpoint/bytes", "checkpoint/seconds", "checkpoint/blocked_seconds"}
     assert saves(tmp_path) == [32, 64, 96]
-    for line in tracking.read(tmp_path / runner.SAVE_LINES):
+    for line in tracking.read(tmp_path / tracking.SAVE_LINES):
         assert line.keys() == names | {"env_steps"}
     assert not any("checkpoint/bytes" in line for line in lines(tmp_path))
 
@@ -249,6 +249,25 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_checkpoint(
     }
 
 
+def test_a_loss_that_is_not_finite_is_told_though_a_save_has_failed(
+    tmp_path, fake, monkeypatch
+):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    def loss(env_steps):
+        if env_steps < 40:
+            return 1.0
+        time.sleep(0.3)  # for the save at 32
+        return math.nan
+
+    fake(loss)
+    monkeypatch.setattr(manifest, "write", full)
+    with pytest.raises(RunError, match=r"loss/critic is nan at env_steps=40; kept: no check"):
+        run(tiny.CONFIG, tmp_path)
+    assert (tmp_path / "diagnosis.json").exists()
+
+
 def test_what_replay_holds_that_is_not_finite_is_named_by_environment_and_step():
     nan, inf = math.nan, math.inf
     assert diagnosis.nonfinite_replay(stored([[1.0, nan, 2.0], [-inf, 0.0, nan]])) == [
@@ -281,8 +300,11 @@ def test_rewards_that_are_nan_in_replay_stop_the_run_and_are_named(tmp_path, mon
         return program._replace(compile=compile_step)
 
     monkeypatch.setattr(runner, "prepare", poisoned)
-    with pytest.raises(RunError, match=r"loss/.* is nan at .*; more in .*diagnosis.json"):
+    with pytest.raises(
+        RunError, match=r"loss/.* is nan at .*; more in .*diagnosis.json"
+    ) as error:
         run(tiny.CONFIG, tmp_path)
+    assert "Replay holds reward that is not finite, first of environment 1" in str(error.value)
     found = json.loads((tmp_path / "diagnosis.json").read_text())
     ago = 4 * len(chunks) - 1  # 4 calls in a chunk
     assert found["nonfinite_replay"] == [
@@ -320,13 +342,53 @@ def test_the_banner_comes_only_once_the_folder_is_claimed(tmp_path, fake, monkey
     assert not console.file.getvalue()
 
 
-def test_running_out_of_memory_is_explained(tmp_path, fake):
+@pytest.mark.parametrize(
+    "error",
+    [
+        jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: out of memory\nlong trace"),
+        MemoryError("Unable to allocate 1.5 GiB"),
+    ],
+)
+def test_running_out_of_memory_is_explained(tmp_path, fake, error):
     def exhausted(_):
-        raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: out of memory\nlong trace")
+        raise error
 
     fake(exhausted)
-    with pytest.raises(runner.RunError, match=r"smaller replay.capacity.*RESOURCE_EXHAUSTED"):
+    with pytest.raises(
+        RunError, match=r"memory.* smaller replay.capacity.*\((RES|Una)"
+    ) as told:
         run(tiny.CONFIG, tmp_path)
+    assert "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"env_steps": "8"}, "env_steps is '8'"),
+        ({"seconds": None}, "seconds is None"),
+        ({"interval": {"weighted": []}}, "weighted is \\[\\]"),
+        ({"interval": {"more": 1}}, "more"),
+        ({"interval": None}, "counters of a run"),
+        ({"more": 1}, "more"),
+    ],
+)
+def test_counters_of_another_kind_are_refused(changes, reason):
+    saved = runner.Progress()._asdict() | {"interval": {}}
+    assert runner._progress(saved) == runner.Progress()
+    with pytest.raises(InvalidInput, match=reason):
+        runner._progress(saved | changes)
+
+
+def test_checkpoints_that_could_not_be_written_are_refused_before_training(
+    tmp_path, fake, monkeypatch
+):
+    fake()
+    run(tiny.CONFIG, tmp_path)
+    folder = checkpoint.root(tmp_path)
+    access = os.access
+    monkeypatch.setattr(os, "access", lambda path, mode: path != folder and access(path, mode))
+    with pytest.raises(InvalidInput, match=r"checkpoints': is not writable"):
+        run(LONG, tmp_path, resume=True)
 
 
 @pytest.mark.parametrize(

@@ -85,8 +85,25 @@ def test_truncation_drops_later_lines_and_half_a_line(tmp_path):
 
 
 def test_truncation_of_nothing_is_nothing(tmp_path):
-    tracking.truncate(tmp_path / "metrics.jsonl", 2)
+    assert tracking.truncate(tmp_path / "metrics.jsonl", 2) == 0
     assert not list(tmp_path.iterdir())
+    assert tracking.read(tmp_path / "metrics.jsonl") == []
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [b'{"env_steps": 2', b"\0\0\0", b"\xff\xfe", b"null", b"7", b'{"a": 1}', b"[" * 99_999],
+)
+def test_a_damaged_line_is_left_out_and_counted_and_the_later_ones_stay(tmp_path, damage):
+    path = tmp_path / "metrics.jsonl"
+    whole = [b'{"env_steps": %d}\n' % env_steps for env_steps in (1, 3, 4, 5)]
+    path.write_bytes(
+        b"".join([whole[0], damage + b"\n", *whole[1:3], damage + b"\n", whole[3]])
+    )
+    assert [line["env_steps"] for line in tracking.read(path)] == [1, 3, 4, 5]
+    assert tracking.truncate(path, 4) == 1  # the other is later than what stays
+    assert path.read_bytes() == b"".join(whole[:3])
+    assert tracking.truncate(path, 4) == 0
 
 
 def test_a_tracker_writes_lines_and_tensorboard_events_at_once(tmp_path):

@@ -244,7 +244,7 @@ def connect(
         return ()
     record = _record(config, logdir, resumed=resumed)
     path = logdir / METRICS
-    past = read(path) if resumed and path.exists() else []
+    past = read(path) if resumed else []
 
     def open_backend() -> Backend:
         _write(logdir, record)

@@ -101,6 +101,19 @@ def nonfinite_replay(replay: Replay) -> list[dict[str, Any]]:
     return found
 
 
+def advice(replay: Replay) -> str:
+    """What to do about a run that has learned from `replay`, in one sentence."""
+    found = nonfinite_replay(replay)
+    if not found:
+        return "Start again with a smaller --optimizer.learning-rate or another --seed"
+    first = found[0]
+    return (
+        f"Replay holds {first['field']} that is not finite, first of environment "
+        f"{first['environment']}, {first['steps_ago']} steps ago: mend what returned it, then "
+        "start again"
+    )
+
+
 @jax.jit
 def _finite_steps(x: Array) -> Array:
     return jnp.isfinite(x).all(range(2, x.ndim))

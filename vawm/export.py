@@ -85,7 +85,7 @@ def _last_return(logdir: pathlib.Path, env_steps: int) -> str:
     path = logdir / tracking.METRICS
     lines = [
         entry
-        for entry in (tracking.read(path) if path.exists() else [])
+        for entry in tracking.read(path)
         if entry["env_steps"] <= env_steps and entry.get("episode/return") is not None
     ]
     if not lines:

@@ -72,18 +72,50 @@ def _refuse_to_lose(logdir: str | os.PathLike[str], started: Config) -> None:
     """Refuses to start a run over, and its metrics, if it should have saved a checkpoint.
 
     Raises:
-      InvalidInput: its metrics reach the first checkpoint that was due.
+      InvalidInput: a line tells of a checkpoint, or its metrics reach the first one that was
+        due by its steps.
     """
-    path = pathlib.Path(logdir).expanduser() / "metrics.jsonl"
-    lines = tracking.read(path) if path.exists() else []
-    if not lines or lines[-1]["env_steps"] < min(started.save_every, started.env_steps):
+    folder = pathlib.Path(logdir).expanduser()
+    saves = tracking.read(folder / tracking.SAVE_LINES)
+    lines = tracking.read(folder / tracking.METRICS) + saves
+    reached = max((line["env_steps"] for line in lines), default=0)
+    if not saves and reached < min(started.save_every, started.env_steps):
         return
     remedy = (
         f"its checkpoints are gone or were never written, and starting over would lose the "
-        f"metrics of {lines[-1]['env_steps']} env steps; choose another --logdir, or start "
-        "over with --fresh"
+        f"metrics of {reached} env steps; choose another --logdir, or start over with --fresh"
     )
     raise InvalidInput("logdir", str(logdir), remedy)
+
+
+def cut_back(logdir: str | os.PathLike[str], *, env_steps: int, logged: int) -> str | None:
+    """Drops the lines of what a run that goes on from `env_steps` will do again.
+
+    Args:
+      logdir: its folder.
+      env_steps: of the checkpoint.
+      logged: env steps of the last line of metrics that was written before it.
+
+    Returns:
+      A line about metrics that are missing among those that stay; None without any.
+
+    Raises:
+      OSError: a file cannot be written; it is as it was.
+    """
+    folder = pathlib.Path(logdir).expanduser()
+    damaged = tracking.truncate(folder / tracking.METRICS, logged)
+    for name in (tracking.VIDEO_LINES, tracking.SAVE_LINES):
+        tracking.truncate(folder / name, env_steps)
+    lines = tracking.read(folder / tracking.METRICS)
+    reached = lines[-1]["env_steps"] if lines else 0
+    if reached < logged:
+        return (
+            f"{tracking.METRICS} ends at {reached} env steps and the checkpoint goes on from "
+            f"{logged}: the lines between are lost"
+        )
+    if damaged:
+        return f"{damaged} damaged lines of {tracking.METRICS} are left out"
+    return None
 
 
 class Restored(NamedTuple):

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import os
 import pathlib
 import time
 from collections.abc import Callable, Mapping
@@ -40,9 +39,6 @@ from vawm.program import Program
 from vawm.tracking import Interval, Line
 from vawm.types import PyTree
 
-SAVE_LINES = "checkpoints.jsonl"
-"""A line about every checkpoint: its size, how long it took, how long training waited."""
-
 
 class RunError(RuntimeError):
     """A run had to stop; its last checkpoint is intact."""
@@ -54,7 +50,7 @@ class Progress(NamedTuple):
     Attributes:
       env_steps: control steps so far.
       updates: updates so far.
-      seconds: wall time so far, pauses between resumed parts left out.
+      seconds: of all steps so far; what lines, videos and checkpoints took is not in it.
       logged: env steps at the last line of metrics.
       interval: measured since that line.
     """
@@ -160,7 +156,8 @@ def check(
         raise InvalidInput("fresh", True, "starts over; leave out --resume, or this")
     if resume:
         resume_lib.check(logdir, config)
-        rundir.check_writable(logdir)
+        for folder in (logdir, checkpoint.root(logdir)):
+            rundir.check_writable(folder)
     elif fresh:
         rundir.check_writable(logdir)
     else:
@@ -207,9 +204,9 @@ def _continue(
             "again when their episodes were played once more; they begin new ones"
         )
     progress = _progress(restored.manifest.progress)
-    tracking.truncate(logdir / "metrics.jsonl", progress.logged)
-    tracking.truncate(logdir / tracking.VIDEO_LINES, progress.env_steps)
-    tracking.truncate(logdir / SAVE_LINES, progress.env_steps)
+    missing = resume_lib.cut_back(logdir, env_steps=progress.env_steps, logged=progress.logged)
+    if missing:
+        say(f"WARNING: {missing}")
     return state, progress
 
 
@@ -220,7 +217,12 @@ def _progress(saved: dict[str, Any]) -> Progress:
       InvalidInput: it was written with other counters.
     """
     try:
-        return Progress(**saved | {"interval": Interval(**saved["interval"])})
+        progress = Progress(**saved | {"interval": Interval(**saved["interval"])})
+        for read, usual in ((progress, Progress()), (progress.interval, Interval())):
+            for name, value, like in zip(usual._fields, read, usual, strict=True):
+                if type(value) is not type(like):
+                    raise TypeError(f"{name} is {value!r:.40}")
+        return progress
     except (TypeError, KeyError) as error:
         remedy = f"does not have the counters of a run ({error}); it is of another version"
         raise InvalidInput("checkpoint", "progress", remedy) from error
@@ -237,7 +239,7 @@ def _loop(
     """Chunk after chunk; the only place where the device and the host meet."""
     display = Display(console, start=progress.env_steps, total=config.env_steps)
     film = video.make(program, config)
-    log_save = functools.partial(_append, logdir / SAVE_LINES)
+    log_save = functools.partial(_append, logdir / tracking.SAVE_LINES)
     last_saved = progress.env_steps
     resumed = bool(progress.env_steps)
     purge_after = progress.logged if resumed else None
@@ -258,9 +260,9 @@ def _loop(
             state, metrics = step(state)
             metrics = jax.device_get(metrics)
             progress = advance(progress, metrics, began=began)
-            saver.check()
-            if diagnosis.first_nonfinite(metrics):
+            if diagnosis.first_nonfinite(metrics):  # says more than a save that fails then
                 _stop(config, logdir, state, metrics, progress, tracker, saver)
+            saver.check()
             done = progress.env_steps >= config.env_steps
             if _crossed(before, progress.env_steps, config.log_every):
                 line = _line(progress)
@@ -339,12 +341,13 @@ def _stop(
     """A loss that is not finite never comes back: better no run than a wrong one."""
     tracker.write(_line(progress))
     written = diagnosis.write(logdir, config, state, metrics)
-    saver.wait()
+    with contextlib.suppress(checkpoint.SaveError, OSError):  # the loss is the reason
+        saver.wait()
     name = diagnosis.first_nonfinite(metrics)
     raise RunError(
         f"{name} is {float(metrics[str(name)])} at env_steps={progress.env_steps}; "
-        f"kept: {_kept(logdir)}; more in {written}. "
-        "Start again with a smaller --optimizer.learning-rate or another --seed"
+        f"kept: {checkpoint.kept(logdir)}; more in {written}. "
+        f"{diagnosis.advice(state.replay)}"
     )
 
 
@@ -362,19 +365,17 @@ def _explained(logdir: pathlib.Path):
         first = str(error).splitlines()[0][:200]
         remedy = "use a smaller replay.capacity, replay.batch_size or size"
         raise RunError(f"out of memory: {remedy} ({first})") from error
+    except MemoryError as error:
+        remedy = "use a smaller replay.capacity or batch, or a machine with more memory"
+        raise RunError(f"out of memory on the host: {remedy} ({error})") from error
     except EnvironmentFailure as error:
         remedy = "to begin a new episode instead, start with --env.on-failure restart"
-        raise RunError(f"{error}; kept: {_kept(logdir)}; {remedy}") from error
+        raise RunError(f"{error}; kept: {checkpoint.kept(logdir)}; {remedy}") from error
     except OSError as error:
         raise RunError(
             f"{error.filename or logdir}: {error.strerror or error}; "
             "put that right, then go on with --resume or start again"
         ) from error
-
-
-def _kept(logdir: str | os.PathLike[str]) -> str:
-    newest = checkpoint.latest(logdir)
-    return f"the checkpoint at {int(newest.name)}" if newest else "no checkpoint yet"
 
 
 def _summarise(

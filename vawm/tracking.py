@@ -31,6 +31,8 @@ Line = dict[str, Any]
 
 COUNTERS = ("env_steps", "updates")
 METRICS, VIDEOS, VIDEO_LINES = "metrics.jsonl", "videos", "videos.jsonl"
+SAVE_LINES = "checkpoints.jsonl"
+"""A line about every checkpoint: its size, how long it took, how long training waited."""
 EPISODE_SUMS = ("episode/return", "episode/length")
 
 
@@ -42,7 +44,7 @@ class Interval(NamedTuple):
       weighted: name -> sum over updates, for metrics that are means.
       counted: name -> sum over chunks, for metrics that are counts.
       env_steps: env steps in the interval.
-      seconds: wall time of the interval.
+      seconds: of its steps; what lines, videos and checkpoints took is not in it.
     """
 
     updates: int = 0
@@ -130,26 +132,48 @@ def finite(entry: Line) -> Line:
 
 
 def read(path: str | os.PathLike[str]) -> list[Line]:
-    """All complete lines of a `metrics.jsonl`; a half-written last one is left out."""
-    lines = []
-    for text in pathlib.Path(path).read_text().splitlines():
-        try:
-            lines.append(json.loads(text))
-        except json.JSONDecodeError:
-            break
-    return lines
+    """All whole lines of a file such as `metrics.jsonl`; none where there is no such file.
+
+    A half-written last line is left out, and so is one that was damaged.
+    """
+    return [entry for entry in _entries(pathlib.Path(path)) if entry is not None]
 
 
-def truncate(path: str | os.PathLike[str], env_steps: int) -> None:
-    """Drops the lines later than `env_steps`, and a half-written one."""
+def truncate(path: str | os.PathLike[str], env_steps: int) -> int:
+    """Drops the lines later than `env_steps`, a half-written one, and those that are damaged.
+
+    Returns:
+      How many were damaged among those that stay.
+    """
     path = pathlib.Path(path)
     if not path.exists():
-        return
-    kept = [entry for entry in read(path) if entry["env_steps"] <= env_steps]
-    text = "".join(as_json(entry) + "\n" for entry in kept)
+        return 0
+    entries = _entries(path)
+    stay = [entry is not None and entry["env_steps"] <= env_steps for entry in entries]
+    last = max((number for number, stays in enumerate(stay) if stays), default=-1)
+    kept = [entry for entry, stays in zip(entries, stay, strict=True) if entry and stays]
     scratch = path.with_suffix(".jsonl.tmp")
-    scratch.write_text(text)
+    scratch.write_text("".join(as_json(entry) + "\n" for entry in kept))
     scratch.replace(path)
+    return entries[: last + 1].count(None)
+
+
+def _entries(path: pathlib.Path) -> list[Line | None]:
+    """What each line says; None for what no run has written whole."""
+    try:
+        text = path.read_text(errors="replace")
+    except FileNotFoundError:
+        return []
+    return [_entry(line) for line in text.split("\n") if line]
+
+
+def _entry(text: str) -> Line | None:
+    try:
+        entry = json.loads(text)
+    except (ValueError, RecursionError):
+        return None
+    whole = isinstance(entry, dict) and isinstance(entry.get("env_steps"), int)
+    return entry if whole else None
 
 
 class Board:
@@ -255,7 +279,7 @@ class Tracker:
         """Gives TensorBoard the videos of a resumed run again that it dropped: those later
         than the last line of metrics."""
         path = self._logdir / VIDEO_LINES
-        for entry in read(path) if path.exists() else ():
+        for entry in read(path):
             video = self._logdir / VIDEOS / entry["video"]
             if entry["env_steps"] > after and video.exists():
                 self._show(entry["video"].partition("-")[0], video, entry["env_steps"])
