@@ -3,8 +3,9 @@
     python tests/drills.py [NAME ...] [--count N]
 
 runs those that take minutes, all of them unless some are named: `kill`, `term`, `flip`, `full`,
-`fuzz`, `corrupt`. It prints a table and exits with 1 if one of them failed. `--count` takes the
-place of the number of tries of `kill`, `term`, `fuzz` and `corrupt`.
+`devices`, `huge`, `fuzz`, `corrupt`. It prints a table and exits with 1 if one of them
+failed. `--count` takes the place of the number of tries of `kill`, `term`, `fuzz` and
+`corrupt`.
 
 All drills, and the tests or the programs of this file that are they:
 
@@ -12,6 +13,7 @@ All drills, and the tests or the programs of this file that are they:
         drills::kill
         test_saver::test_whenever_a_run_is_killed_a_whole_checkpoint_is_left
         test_tracking::test_truncation_drops_later_lines_and_half_a_line
+        test_resume::test_lines_that_are_missing_from_what_a_run_goes_on_from_are_told
  2  A resumed run equals one in one piece bit for bit
         drills::kill
         test_runner::test_k_steps_and_the_rest_equal_a_run_in_one_piece
@@ -32,6 +34,7 @@ All drills, and the tests or the programs of this file that are they:
         test_checkpoint_damage::test_what_is_not_complete_is_no_checkpoint
         test_checkpoint_damage::test_only_empty_folders_are_no_reason_to_start_over
         test_resume::test_a_run_whose_checkpoints_are_gone_is_not_started_over
+        test_resume::test_a_run_that_saved_by_the_clock_is_not_started_over_either
  6  A full disk while saving and while logging
         drills::full
         test_runner::test_a_disk_that_is_full_when_saving_ends_the_run_and_keeps_the_checkpoint
@@ -41,6 +44,7 @@ All drills, and the tests or the programs of this file that are they:
         test_rundir::test_a_path_through_a_file_is_refused
         test_rundir::test_a_folder_without_permission_is_refused
         test_runner::test_bad_input_is_refused_with_nothing_written
+        test_runner::test_checkpoints_that_could_not_be_written_are_refused_before_training
  8  Two runs in one folder; the lock of a dead process
         test_rundir::test_a_second_claim_is_refused_and_names_the_holder
         test_rundir::test_the_lock_of_a_killed_process_is_free
@@ -53,11 +57,13 @@ All drills, and the tests or the programs of this file that are they:
 10  Infinite and huge observations, and actions
         test_host_train::test_what_is_not_finite_ends_the_run_with_environment_step_and_field
         test_host_train::test_huge_observations_and_rewards_are_learned_from_and_all_stays_finite
+        drills::huge
         test_envs_host_pool::test_continuous_actions_are_clipped_and_nan_is_no_action
         test_envs_stream::test_failed_physics_ends_the_episode_and_the_next_step_resets_it
         test_envs_stream::test_a_nan_action_counts_as_zero_and_a_large_one_is_clipped
 11  A loss that is NaN: the run stops, with a diagnosis
         test_runner::test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_checkpoint
+        test_runner::test_a_loss_that_is_not_finite_is_told_though_a_save_has_failed
         test_runner::test_rewards_that_are_nan_in_replay_stop_the_run_and_are_named
         test_checkpoint::test_parameters_that_are_not_finite_are_not_saved
 12  Environments that raise, die or hang
@@ -80,11 +86,13 @@ All drills, and the tests or the programs of this file that are they:
         test_checkpoint::test_a_leaf_that_differs_is_named
         test_resume::test_another_choice_is_refused_by_name
         test_checkpoint_hostile::test_a_manifest_that_says_something_else_is_refused
+        test_rundir::test_a_config_of_another_version_says_which_and_what_to_do
 16  Malicious checkpoints
         test_checkpoint_hostile::test_a_pickle_in_the_place_of_any_file_is_not_executed
         test_checkpoint_hostile::test_a_file_elsewhere_is_refused
         test_checkpoint_hostile::test_a_link_is_refused_though_what_it_leads_to_is_right
         test_checkpoint_hostile::test_a_huge_manifest_is_not_read
+        test_export::test_a_damaged_file_is_one_line
 17  More than memory holds
         test_memory::test_five_million_images_are_refused_with_the_numbers
         test_memory::test_what_does_not_fit_is_refused_with_the_largest_replay_that_would
@@ -104,6 +112,7 @@ All drills, and the tests or the programs of this file that are they:
         test_saver::test_time_is_counted_from_the_save_before
         test_runner::test_a_chunk_without_a_step_forward_is_not_saved_again
 21  Another number of devices
+        drills::devices
         test_sharding::test_two_devices_give_what_one_gives
 """
 
@@ -127,6 +136,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import fuzz as fuzzing
+import huge_numbers
 import hypothesis
 import jax
 import rich.console
@@ -167,6 +177,7 @@ def config_for(env_steps: int, save_every: int = 16) -> Config:
 def train(logdir: str, env_steps: int, save_every: int) -> int:
     """What a child process does: begins or resumes a run."""
     console = rich.console.Console(width=200)
+    print(f"devices: {jax.device_count()}", flush=True)
     begun = (pathlib.Path(logdir) / "config.json").exists()
     try:
         return runner.run(
@@ -187,11 +198,16 @@ class Child:
     What it prints goes into a file: nobody would read a pipe, and a full one stops who writes.
     """
 
-    def __init__(self, logdir: pathlib.Path, env_steps: int, save_every: int = 16):
+    def __init__(
+        self, logdir: pathlib.Path, env_steps: int, save_every: int = 16, devices: int = 1
+    ):
         command = [sys.executable, __file__, "child", logdir, env_steps, save_every]
         self._file = tempfile.TemporaryFile("w+")  # noqa: SIM115
         self.process = subprocess.Popen(
-            [str(word) for word in command], stdout=self._file, stderr=subprocess.STDOUT
+            [str(word) for word in command],
+            stdout=self._file,
+            stderr=subprocess.STDOUT,
+            env=os.environ | {"XLA_FLAGS": with_devices(devices)},
         )
 
     def said(self) -> str:
@@ -207,11 +223,18 @@ class Child:
         self._file.close()
 
 
-def finish(logdir: pathlib.Path, env_steps: int, save_every: int = 16) -> None:
-    """A run, begun or resumed, to its end."""
-    with Child(logdir, env_steps, save_every) as child:
+def with_devices(count: int) -> str:
+    """Flags of XLA with which a CPU is so many devices."""
+    flags = os.environ.get("XLA_FLAGS", "")
+    return f"{flags} --xla_force_host_platform_device_count={count}".strip()
+
+
+def finish(logdir: pathlib.Path, env_steps: int, save_every: int = 16, devices: int = 1) -> str:
+    """A run, begun or resumed, to its end; returns what it printed."""
+    with Child(logdir, env_steps, save_every, devices) as child:
         code = child.process.wait(timeout=PATIENCE)
         assert code == 0, child.said()[-2000:]
+        return child.said()
 
 
 def reached(logdir: pathlib.Path) -> int:
@@ -381,6 +404,26 @@ def fill(disk: pathlib.Path, save_every: int) -> str:
     return f"{told[0].replace(str(logdir), 'LOGDIR')} ({kept}, and went on)"
 
 
+def devices(folder: pathlib.Path) -> Outcome:
+    """A run on one device goes on where there are four, and then on one again."""
+    for env_steps, count in ((64, 1), (128, 4), (192, 1)):
+        said = finish(folder / "run", env_steps, devices=count)
+        assert f"devices: {count}\n" in said, said[-2000:]
+    finish(folder / "whole", 192)
+    check_metrics(folder / "run", 192)
+    runs.assert_same(folder / "run", folder / "whole", config_for(192), tiny.env())
+    return Outcome(3, "1, 4 and 1 devices, as on one in one piece, bit for bit")
+
+
+def huge(folder: pathlib.Path) -> Outcome:
+    """Every agent learns from observations and rewards of 1e30, and acts on them."""
+    del folder
+    for config in huge_numbers.AGENTS:
+        huge_numbers.learn_from_them(config)
+    names = [config.agent for config in huge_numbers.AGENTS]
+    return Outcome(len(names), f"{', '.join(names)}: all that is learned stays finite")
+
+
 def fuzz(folder: pathlib.Path, count: int = 2000) -> Outcome:
     """Random configs are refused by name, or their step is traced, every 100th is run."""
     accepted = refused = run = 0
@@ -410,7 +453,9 @@ def fuzz(folder: pathlib.Path, count: int = 2000) -> Outcome:
     return Outcome(accepted + refused, f"{refused} refused, {accepted} traced, {run} run")
 
 
-DRILLS = {drill.__name__: drill for drill in (kill, term, flip, full, fuzz, corrupt)}
+DRILLS = {
+    drill.__name__: drill for drill in (kill, term, flip, full, devices, huge, fuzz, corrupt)
+}
 RANDOM = random.Random()
 
 
@@ -427,7 +472,7 @@ def main() -> int:
     for name in arguments.names or DRILLS:
         print(f"{name} ...", flush=True)
         RANDOM.seed(arguments.seed)
-        counted = arguments.count and name not in ("flip", "full")
+        counted = arguments.count and name in ("kill", "term", "fuzz", "corrupt")
         choices = {"count": arguments.count} if counted else {}
         began = time.monotonic()
         try:

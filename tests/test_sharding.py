@@ -4,16 +4,18 @@ import functools
 import os
 import subprocess
 import sys
+import tempfile
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 import tiny
+import toy
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 from test_objective import batch
 
-from vawm import cache, train
+from vawm import cache, checkpoint, train
 from vawm.agent import make_agent
 from vawm.collector import make_collect
 from vawm.learner import make_update
@@ -68,6 +70,22 @@ def check_collect(collect, state):
     assert_close(actual[1:], expected[1:])
 
 
+def check_checkpoint(state, spec, config):
+    """What two devices save is what one has: every bit, and on one device again."""
+    spread = state._replace(
+        learner=put(state.learner),
+        collector=put(state.collector, "data"),
+        replay=put(state.replay, "data"),
+    )
+    assert len(spread.replay.trajectory.obs.devices()) == 2
+    with tempfile.TemporaryDirectory() as folder:
+        usual = {"config": config, "spec": spec, "progress": {}}
+        checkpoint.save(folder, spread, env_steps=8, **usual)
+        restored, _ = checkpoint.restore(folder, jax.eval_shape(lambda: state))
+    toy.assert_equal(restored, state)
+    assert {len(x.devices()) for x in jax.tree.leaves(restored)} == {1}
+
+
 def main():
     cache.enable()
     env, config = tiny.env(), tiny.CONFIG
@@ -83,6 +101,7 @@ def main():
     learner = state.learner._replace(params=jax.tree.map(disturb, state.learner.params))
     check_update(compiled(make_update(agent, config)), learner, batch(agent))
     check_collect(compiled(make_collect(env, agent, config)), state)
+    check_checkpoint(state._replace(learner=learner), env.spec, config)
 
 
 if __name__ == "__main__":
