@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+import types
 
 import numpy as np
 import pytest
@@ -219,6 +220,28 @@ def test_another_project_or_a_new_run_is_a_new_remote_run(tmp_path, monkeypatch,
     assert json.loads((tmp_path / backends.RECORD).read_text())["line"] == 24
 
 
+@pytest.mark.parametrize("mode", ["online", "shared", "offline", "disabled"])
+def test_wandb_never_asks_who_sits_at_the_terminal(tmp_path, monkeypatch, mode):
+    """Its prompt would wait in a thread for standard input, until the process cannot end."""
+    settings = types.SimpleNamespace(mode=mode)
+    wandb = types.SimpleNamespace(
+        setup=lambda: types.SimpleNamespace(settings=settings),
+        login=lambda *, prompt, verify: prompt or verify,  # nobody is logged in
+        init=lambda **_: Remote(),
+        Settings=dict,
+        Video=None,
+    )
+    monkeypatch.setitem(sys.modules, "wandb", wandb)
+    said = part(tmp_path, 8)
+    if mode in ("online", "shared"):
+        assert [text.partition(":")[2] for text in said] == [
+            " wandb gets no more of this run (not logged in: `wandb login`, or set "
+            "WANDB_MODE=offline); metrics.jsonl has all"
+        ]
+    else:
+        assert not any("not logged in" in text for text in said)
+
+
 class Broken:
     """A TensorBoard writer with a fault of its own."""
 
@@ -265,7 +288,8 @@ backends.check(config)
 further = backends.connect(config, logdir, resumed=resumed, say=print)
 with Tracker(logdir, further=further) as tracker:
     for step in map(int, steps):
-        tracker.write({"env_steps": step, "loss/total": step / 10, "episode/return": None})
+        line = {"env_steps": step, "loss/total": step / 10, "episode/return": None, "time": 1.5}
+        tracker.write(line)
         further[0].write_video("video/episode", pathlib.Path(gif), step)
 """
 
@@ -325,3 +349,4 @@ def test_trackio_takes_lines_and_videos_into_its_database(tmp_path, gif):
     losses = [(step, entry["loss/total"]) for step, entry in stored if "loss/total" in entry]
     assert sorted(losses) == [(8, 0.8), (16, 1.6), (24, 2.4)]
     assert sum("video/episode" in entry for _, entry in stored) == 3
+    assert [entry["seconds"] for _, entry in stored if "loss/total" in entry] == [1.5] * 3

@@ -17,7 +17,8 @@ extended later, stays. The step of both backends is `env_steps`.
               WANDB_MODE=offline it writes to <logdir>/wandb, one folder for each part of a run,
               which `wandb sync` sends. WANDB_ENTITY and the other variables of its own apply.
     trackio   a database on this machine (TRACKIO_DIR), or a server (TRACKIO_SPACE_ID,
-              TRACKIO_SERVER_URL); any order of steps is taken, any number of times.
+              TRACKIO_SERVER_URL); any order of steps is taken, any number of times. What lines
+              call `time` is `seconds` there.
 """
 
 from __future__ import annotations
@@ -153,11 +154,19 @@ class Once:
 
 
 class WeightsAndBiases:
-    """A run on Weights & Biases."""
+    """A run on Weights & Biases.
+
+    Raises:
+      ConnectionError: nobody is logged in, and it is not told to stay offline.
+    """
 
     def __init__(self, config: Config, logdir: pathlib.Path, run: str):
         import wandb
 
+        online = wandb.setup().settings.mode not in ("offline", "dryrun", "disabled")
+        # Else it asks who sits at the terminal, in a thread that nobody waits for.
+        if online and not wandb.login(prompt=False, verify=False):
+            raise ConnectionError("not logged in: `wandb login`, or set WANDB_MODE=offline")
         self._video = wandb.Video
         # Both also bound what its own hook at the end of the process waits for.
         settings = wandb.Settings(console="off", init_timeout=PATIENCE, finish_timeout=PATIENCE)
@@ -183,7 +192,7 @@ class WeightsAndBiases:
 
 
 class Trackio:
-    """A run in trackio, which knows it by its name."""
+    """A run in trackio, which knows it by its name; `time` is a word of its own there."""
 
     def __init__(self, config: Config, logdir: pathlib.Path, run: str):
         import trackio
@@ -199,7 +208,10 @@ class Trackio:
         )
 
     def write(self, entry: Line) -> None:
-        self._run.log(finite(entry), step=entry["env_steps"])
+        renamed = {
+            "seconds" if name == "time" else name: x for name, x in finite(entry).items()
+        }
+        self._run.log(renamed, step=entry["env_steps"])
 
     def write_video(self, name: str, gif: pathlib.Path, env_steps: int) -> None:
         self._run.log({name: self._video(gif)}, step=env_steps)
