@@ -1,11 +1,13 @@
 """Checkpoints: bit for bit, all or nothing, never a silent difference."""
 
+import contextlib
 import errno
 import gc
 import logging
 import re
 import resource
 import shutil
+import sys
 from typing import Any, NamedTuple
 
 import jax
@@ -211,7 +213,32 @@ def test_bytes_are_told_in_a_unit_that_suits_them(nbytes, text):
     assert checkpoint.writing.amount(nbytes) == text
 
 
-# TensorStore may still want to tell the loop that Orbax has closed.
+class Stray:
+    """Raises where nobody can hear it, as TensorStore's callbacks do."""
+
+    def __init__(self, text):
+        self._text = text
+
+    def __del__(self):
+        raise RuntimeError(self._text)
+
+
+@pytest.mark.parametrize("error", [None, OSError("full")])
+def test_after_an_error_what_a_closed_loop_is_told_stays_unheard_and_nothing_else(
+    monkeypatch, error
+):
+    heard = []
+    monkeypatch.setattr(sys, "unraisablehook", lambda stray: heard.append(str(stray.exc_value)))
+    with contextlib.suppress(OSError), checkpoint.arrays.quiet():
+        Stray("Event loop is closed")
+        if error:
+            raise error
+    Stray("Event loop is closed")
+    Stray("something else")
+    assert heard == ([] if error else ["Event loop is closed"]) + ["something else"]
+
+
+# TensorStore may still want to tell the loop that Orbax has closed, once pytest listens again.
 @pytest.mark.filterwarnings("ignore:.*:pytest.PytestUnraisableExceptionWarning")
 def test_what_cannot_be_written_is_one_error_and_no_pages_of_traces(tmp_path, caplog):
     """Files may not grow beyond what all but one array need, as Orbax's threads find out."""

@@ -5,7 +5,8 @@ from __future__ import annotations
 import contextlib
 import logging
 import pathlib
-from collections.abc import Iterator, Mapping
+import sys
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import jax
@@ -59,13 +60,16 @@ def quiet() -> Iterator[None]:
     """Keeps Orbax and what it runs on from logging, for the whole process.
 
     Where it cannot write, it logs a trace for every array, hundreds of lines on a full disk,
-    and raises the error as well.
+    and raises the error as well. TensorStore then has more to tell to a loop that Orbax has
+    closed, some of it later: after an error these traces stay unheard for good.
     """
     loggers = [logging.getLogger(name) for name in ("absl", "asyncio")]
     for logger in loggers:
         logger.addFilter(_nothing)
+    earlier, sys.unraisablehook = sys.unraisablehook, _but_closed_loops(sys.unraisablehook)
     try:
         yield
+        sys.unraisablehook = earlier
     finally:
         for logger in loggers:
             logger.removeFilter(_nothing)
@@ -73,6 +77,17 @@ def quiet() -> Iterator[None]:
 
 def _nothing(record: logging.LogRecord) -> bool:
     return False
+
+
+def _but_closed_loops(hook: Callable[[Any], object]) -> Callable[[Any], object]:
+    """A `sys.unraisablehook` that passes on to `hook` all but what a closed loop is told."""
+
+    def hear(unraisable: Any) -> None:
+        error = unraisable.exc_value
+        if not (isinstance(error, RuntimeError) and str(error) == "Event loop is closed"):
+            hook(unraisable)
+
+    return hear
 
 
 def _compare(path: pathlib.Path, found: Any, expected: Mapping[str, LeafInfo]) -> None:
