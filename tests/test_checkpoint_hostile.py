@@ -207,7 +207,7 @@ def test_a_field_that_is_missing_or_of_another_kind_is_refused(path, field):
         (lambda c: c.update(more=1), "'more' is not known"),
         (
             lambda c: c.update(schema=2, version="9.9"),
-            "its layout is not known; vawm 9.9 wrote it and this is vawm .*: use the version",
+            "its layout is not known; vawm 9.9 wrote it and this is vawm .*: use the one",
         ),
         (
             lambda c: c["config"].update(colour=1) or c.update(version="9.9"),

@@ -277,13 +277,13 @@ def flip(data):
         (
             "config.json",
             lambda data: data.replace(b'"schema": 1', b'"schema": 2'),
-            "its layout is not known; vawm .* wrote it .* or export it again",
+            "its layout is not known; .* use the one that wrote it, or export it again",
         ),
         ("config.json", lambda data: data.replace(b'"seed": 0', b'"seed": -1'), "seed=-1"),
         (
             "config.json",
             lambda data: data.replace(b'"seed"', b'"sede"'),
-            "sede=0: is not known; vawm",
+            "sede=0: is not known; another state of vawm",
         ),
         ("config.json", lambda data: data.replace(b'"obs"', b'"abs"'), "obs is missing"),
     ],

@@ -105,8 +105,11 @@ def test_a_config_of_another_version_says_which_and_what_to_do(tmp_path):
         rundir.read_config(tmp_path)
     assert str(error.value) == (
         f"logdir='{path}': Config.colour=1: is not known; vawm 9.9 wrote it and this is vawm "
-        f"{manifest.version()}: use the version that wrote it, or start over with --fresh"
+        f"{manifest.version()}: use the one that wrote it, or start over with --fresh"
     )
+    path.write_text(json.dumps(content | {"vawm": manifest.version()}))
+    with pytest.raises(InvalidInput, match=r"known; another state of vawm .* wrote it"):
+        rundir.read_config(tmp_path)
 
 
 def test_a_config_that_cannot_be_written_leaves_the_folder_as_it_was(tmp_path, monkeypatch):

@@ -66,10 +66,11 @@ class OtherVersion(InvalidInput):
         written: object,
         otherwise: str = "start over with --fresh",
     ):
-        remedy = (
-            f"{why}; vawm {str(written)[:40]} wrote it and this is vawm {version()}: use the "
-            f"version that wrote it, or {otherwise}"
-        )
+        theirs, ours = str(written)[:40], version()
+        who = f"vawm {theirs} wrote it and this is vawm {ours}"
+        if theirs == ours:
+            who = f"another state of vawm {ours} wrote it"
+        remedy = f"{why}; {who}: use the one that wrote it, or {otherwise}"
         super().__init__(field, str(where), remedy)
 
 
