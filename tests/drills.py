@@ -57,6 +57,7 @@ All drills, and the tests or the programs of this file that are they:
 10  Infinite and huge observations, and actions
         test_host_train::test_what_is_not_finite_ends_the_run_with_environment_step_and_field
         test_host_train::test_huge_observations_and_rewards_are_learned_from_and_all_stays_finite
+        test_train_storm::test_observations_and_rewards_of_1e30_leave_all_that_is_learned_finite
         drills::huge
         test_envs_host_pool::test_continuous_actions_are_clipped_and_nan_is_no_action
         test_envs_stream::test_failed_physics_ends_the_episode_and_the_next_step_resets_it

@@ -233,6 +233,27 @@ def test_prediction_loss_compares_images_as_bytes():
     np.testing.assert_allclose(loss.reconstruction, losses.image_mse(obs, target), rtol=1e-6)
 
 
+@pytest.mark.parametrize(
+    "obs",
+    [
+        jnp.zeros((2, 3, 7), jnp.int32),
+        jnp.zeros((2, 3, 4, 4, 3)),
+        jnp.zeros((2, 4, 7)),
+        jnp.zeros((3, 7)),
+        {"vector": jnp.zeros((2, 3, 7))},
+    ],
+    ids=["whole numbers", "images of floats", "another time", "no batch", "another tree"],
+)
+def test_prediction_loss_refuses_observations_that_are_not_one_for_each_state(obs):
+    _, reward_logits, cont_logit = predictions((7,))
+    predicted = obs["vector"] if isinstance(obs, dict) else obs
+    rest = jnp.zeros((2, 3)), jnp.zeros((2, 3), bool)
+    with pytest.raises(AssertionError):
+        prediction_loss(
+            predicted, reward_logits, cont_logit, obs, *rest, bins=BINS, discount=0.9
+        )
+
+
 def test_prediction_loss_refuses_rewards_of_another_time():
     obs, reward_logits, cont_logit = predictions((7,))
     with pytest.raises(AssertionError):

@@ -73,6 +73,20 @@ def test_an_update_moves_all_that_learns_with_an_optimiser_each(compiled):
     chex.assert_trees_all_close(after.slow_critic, slow, atol=1e-7)
 
 
+def test_observations_and_rewards_of_1e30_leave_all_that_is_learned_finite(compiled):
+    states, _ = roll(compiled, 0, 5)
+    state = jax.tree.map(jnp.copy, states[-1])
+    stored = state.replay.trajectory
+    obs, reward = stored.obs.at[:, ::3].set(1e30), stored.reward.at[:, ::3].set(-1e30)
+    huge = stored._replace(obs=obs, reward=reward)
+    state = state._replace(replay=state.replay._replace(trajectory=huge))
+    for _ in range(3):
+        state, metrics = compiled[1](state)
+        assert all(np.isfinite(value) for value in metrics.values())
+    assert state.learner.step >= states[-1].learner.step + 3
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(state.learner))
+
+
 def test_replay_keeps_no_latents(compiled):
     init, _ = compiled
     state = jax.eval_shape(init, jax.random.key(0))

@@ -38,3 +38,12 @@ def test_it_learns_and_replay_remembers_probabilities():
     assert kept.dtype == jnp.float32
     np.testing.assert_allclose(kept.sum(-1), 1.0, rtol=1e-5)
     assert ((kept > 0) & (kept < 1)).all()
+    # Numbers of 1e30, whose squares are infinite, are learned from and all stays finite.
+    stored = state.replay.trajectory
+    obs, reward = stored.obs.at[:, ::3].set(1e30), stored.reward.at[:, ::3].set(-1e30)
+    huge = stored._replace(obs=obs, reward=reward)
+    state = state._replace(replay=state.replay._replace(trajectory=huge))
+    for _ in range(3):
+        state, metrics = run(state)
+        assert all(np.isfinite(value) for value in metrics.values())
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(state.learner))

@@ -114,6 +114,7 @@ def test_every_rule_is_about_a_field():
         ("seed", 2**32, "from 0 to 4294967295"),
         ("replay.batch_length", 1, "at least 2"),
         ("env_steps", 2**31, "below 2147483648"),
+        ("critic.slow_scale", 2**32, "below 2147483648, or write it with a point"),
         ("train_ratio", 2**31 // 8, "use 268435454 at most"),
     ],
 )

@@ -131,8 +131,9 @@ def _check_number(name: str, value: Any, kind: type) -> None:
     holds, remedy = RULES.get(name, POSITIVE)
     if not holds(value):
         raise InvalidInput(name, value, remedy)
-    if kind is int and value >= INT32 and name != "seed":
-        raise InvalidInput(name, value, f"use a number below {INT32}")
+    if isinstance(value, int) and value >= INT32 and name != "seed":
+        point = "" if kind is int else ", or write it with a point"
+        raise InvalidInput(name, value, f"use a number below {INT32}{point}")
 
 
 def _check_together(config: Config) -> None:

@@ -68,7 +68,9 @@ def prediction_loss(
       AssertionError: predictions and targets have different shapes.
     """
     chex.assert_equal_shape([cont_logit, reward, is_terminal])
+    chex.assert_trees_all_equal_structs(obs_prediction, obs)
     parts = jax.tree.map(reconstruction_loss, obs_prediction, obs)
+    chex.assert_equal_shape([cont_logit, *jax.tree.leaves(parts)])
     reconstruction = jax.tree.reduce(jnp.add, parts)
     return PredictionLoss(
         reconstruction=reconstruction,

@@ -109,7 +109,7 @@ def scale_gradient(x: Array, *, scale: float) -> Array:
       scale: by which the gradient is multiplied: 1/2 in MuZero, before each step of the model.
 
     Returns:
-      `[...]` exactly x.
+      `[...]` exactly x where it is finite.
     """
     stopped = jax.lax.stop_gradient(x)
     return stopped + scale * (x - stopped)

@@ -17,9 +17,9 @@ def vagram_loss(value: Value, prediction: Array, target: Array) -> Array:
 
         L = sum_j (dV/dx_j)^2 e_j^2,    e = prediction - sg(x),    dV/dx at sg(x)
 
-    n L bounds (grad V . e)^2, the first order of the squared error of the value, where n is
-    the size of x (Cauchy-Schwarz). Unlike that, L is least only where e_j = 0 for every j
-    that the value depends on: errors in different dims never cancel.
+    n L bounds (grad V . e)^2, the square of the first-order expansion of V(prediction) - V(x),
+    where n is the size of x (Cauchy-Schwarz). Unlike that, L is least only where e_j = 0 for
+    every j with dV/dx_j other than 0 at x: errors in different dims never cancel.
 
     Args:
       value: maps `[..., n]` to `[...]`, each value from its own state alone.
@@ -38,13 +38,13 @@ def vagram_loss(value: Value, prediction: Array, target: Array) -> Array:
 
 
 def vagram_taylor_loss(value: Value, prediction: Array, target: Array) -> Array:
-    """First order of the squared error of the value (Voelcker et al., 2022).
+    """Square of the value's first-order error (Voelcker et al., 2022).
 
         L = (grad V . e)^2,    e = prediction - sg(x),    grad V at sg(x)
 
     L is zero on the whole hyperplane grad V . e = 0, however long e is. A prediction can
     drift along it without bound, to where the expansion says nothing about the value;
-    `vagram_loss` has no such direction but those that V ignores.
+    `vagram_loss` has no such direction but those along which V is flat at x.
 
     Args:
       value: maps `[..., n]` to `[...]`, each value from its own state alone.
@@ -68,7 +68,7 @@ def vagram_second_order_loss(value: Value, prediction: Array, target: Array) -> 
         L = 2 (g . e)^2 + 1/2 (e' H e)^2  >=  (g . e + 1/2 e' H e)^2
 
     g and H are gradient and Hessian of V at sg(x); e = prediction - sg(x). The right side is
-    the second-order Taylor expansion of (V(prediction) - V(x))^2; the step to L is
+    the square of the second-order expansion of V(prediction) - V(x); the step to L is
     (a + b)^2 <= 2 a^2 + 2 b^2. L is zero where both terms are, so it has the drawback of
     `vagram_taylor_loss`: e can grow where g . e = e' H e = 0.
 
