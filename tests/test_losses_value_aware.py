@@ -142,8 +142,13 @@ def test_vaml_by_hand():
 
 
 def test_vaml_refuses_critics_without_targets():
-    with pytest.raises(ValueError, match="size"):
+    with pytest.raises(AssertionError):
         losses.vaml_loss(jnp.zeros((5, 2, 3)), jnp.zeros((4, 3)))
+
+
+def test_vaml_refuses_a_mean_over_no_samples():
+    with pytest.raises(AssertionError):
+        losses.iter_vaml_loss(jnp.zeros((0, 3)), jnp.zeros(3))
 
 
 def logits(shape=(2, 3, 41)):

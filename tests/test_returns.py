@@ -143,6 +143,12 @@ def test_replay_returns_ignore_what_follows_the_end_of_an_episode():
     assert by_bootstrap[0, 2] == pytest.approx(0.95 * 0.9**2)
 
 
+def test_lambda_returns_refuse_a_bootstrap_of_another_shape():
+    steps = [jnp.zeros((5, 3))] * 3
+    with pytest.raises(AssertionError):
+        returns.lambda_returns(*steps, jnp.zeros(1), lambda_=1)
+
+
 def test_replay_returns_refuse_time_first_flags():
     flags = jnp.zeros((5, 2), bool)
     with pytest.raises(AssertionError):

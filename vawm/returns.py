@@ -43,6 +43,7 @@ def lambda_returns(
     """
     chex.assert_equal_shape([reward, discount, value])
     last = value[-1] if bootstrap is None else bootstrap
+    chex.assert_equal_shape([last, reward[0]])
 
     def backward(next_return, step):
         r, d, v = step

@@ -38,6 +38,7 @@ def vaml_loss(prediction_values: Array, target_values: Array) -> Array:
     Raises:
       AssertionError: the shapes do not fit each other.
     """
+    chex.assert_equal_shape_prefix([prediction_values, target_values], 1)
     return jax.vmap(iter_vaml_loss)(prediction_values, target_values).max(0)
 
 
@@ -59,8 +60,9 @@ def iter_vaml_loss(prediction_values: Array, target_value: Array) -> Array:
       the critic's parameters.
 
     Raises:
-      AssertionError: the shapes do not fit each other.
+      AssertionError: there is no sample, or the shapes do not fit each other.
     """
+    chex.assert_axis_dimension_gt(prediction_values, 0, 0)
     return jnp.square(_deviations(prediction_values, target_value).mean(0))
 
 
