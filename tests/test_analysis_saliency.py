@@ -97,7 +97,7 @@ def some(maps):
 
 @pytest.fixture(scope="module")
 def slow(setting, straight):
-    """Rows of the decoder's Jacobian, `[F, ..., S * K]`, and dV/dz."""
+    """Rows of the decoder's Jacobian, `[F, ..., S * K]`, and dV/dz, on the simplex of z."""
     policy, agent, *_ = setting
     latent = straight[1]
 
@@ -112,9 +112,12 @@ def slow(setting, straight):
     jacobian, slope = jax.jit(
         jax.vmap(lambda *s: (jax.jacrev(decode)(*s), jax.grad(value)(*s)))
     )(latent.stoch, latent.deter)
-    flat = {k: np.asarray(x, np.float64) for k, x in jacobian.items()}
-    flat = {k: x.reshape(*x.shape[:-2], -1) for k, x in flat.items()}
-    return flat, np.asarray(slope, np.float64).reshape(FRAMES, -1)
+
+    def flat(x):
+        x = np.asarray(x, np.float64)
+        return (x - x.mean(-1, keepdims=True)).reshape(*x.shape[:-2], -1)
+
+    return {k: flat(x) for k, x in jacobian.items()}, flat(slope)
 
 
 def over_colours(squares, kind):

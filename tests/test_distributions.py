@@ -173,3 +173,12 @@ def test_policies_have_gradients_under_jit():
     for gradient in gradients:
         assert np.isfinite(gradient).all()
         assert (np.asarray(gradient) != 0).all()
+
+
+def test_on_the_simplex_nothing_changes_but_that_gradients_are_centred():
+    z = jax.nn.softmax(jax.random.normal(jax.random.key(0), (2, 3, 4)))
+    np.testing.assert_allclose(distributions.on_simplex(z), z, rtol=1e-6)
+    slope = jax.random.normal(jax.random.key(1), z.shape)
+    gradient = jax.grad(lambda z: (slope * distributions.on_simplex(z)).sum())(z)
+    centred = slope - slope.mean(-1, keepdims=True)
+    np.testing.assert_allclose(gradient, centred, rtol=1e-5, atol=1e-6)

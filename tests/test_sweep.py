@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 
+import analysis_drawings
 import numpy as np
 import pytest
 import tiny
@@ -265,6 +266,17 @@ def test_figures_are_drawn_with_a_panel_for_everything(finished, seeds, tmp_path
     data = path.read_bytes()
     width, height = (int.from_bytes(data[i : i + 4], "big") for i in (16, 20))
     assert (width, height) == (2 * 495, 2 * 352)
+
+
+def test_a_band_leaves_out_the_seed_that_the_table_leaves_out(finished, tmp_path, monkeypatch):
+    drawn = analysis_drawings.keep(monkeypatch)
+    sweep, _ = finished
+    figures.plot(results.read(sweep), sweep, tmp_path / "band.png", seeds="band")
+    (panel,) = drawn["band.png"].axes
+    lines = analysis_drawings.lines(panel)
+    assert lines.keys() == {"finish", "fail (1 of 2 seeds)"}
+    np.testing.assert_array_equal(lines["finish"], [1.5, 4.5])
+    np.testing.assert_array_equal(lines["fail (1 of 2 seeds)"], [1.0, 3.0])
 
 
 def test_columns_are_written_in_order_under_their_headings(finished, tmp_path):

@@ -19,6 +19,7 @@ with warnings.catch_warnings():
 __all__ = [
     "Policy",
     "bounded_normal",
+    "on_simplex",
     "one_hot_categorical",
     "probabilities",
     "sample_index",
@@ -45,6 +46,18 @@ def sample_index(logits: Array, uniform: Array, *, unimix: float) -> Array:
       `[...]` int32 in [0, K).
     """
     return _invert(probabilities(logits, unimix=unimix), uniform)
+
+
+def on_simplex(stoch: Array) -> Array:
+    """The same z, for what sums to 1 in each categorical; gradients by it are centred there.
+
+    What depends on z alone has a gradient that is open up to a number for all classes of a
+    categorical, as nothing moves z off the simplex. Through here that number is 0.
+
+    Args:
+      stoch: `[..., S, K]`.
+    """
+    return stoch - stoch.mean(-1, keepdims=True) + 1 / stoch.shape[-1]
 
 
 def sample_one_hot(logits: Array, uniform: Array, *, unimix: float) -> Array:

@@ -40,9 +40,7 @@ def make_value_gradient_loss(
     def value_of(critic: PyTree, deter: Array) -> Callable[[Array], Array]:
         def value(z: Array) -> Array:
             stoch = z.reshape(*z.shape[:-1], model.stoch, model.classes)
-            # The same z, for what sums to 1; its gradient is centred in each categorical.
-            stoch = stoch - stoch.mean(-1, keepdims=True) + 1 / model.classes
-            stoch = stoch.astype(deter.dtype)
+            stoch = distributions.on_simplex(stoch).astype(deter.dtype)
             mean = agent.critic.code.mean(agent.critic.logits(critic, Latent(deter, stoch)))
             return transforms.symlog(mean) if model.value_gradient_unit == "symlog" else mean
 

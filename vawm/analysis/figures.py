@@ -268,6 +268,10 @@ def curves(all_curves: Curves, path: pathlib.Path) -> None:
 
 
 def _legend_below(axes: np.ndarray) -> None:
-    """The names of the first panel's lines, which are those of all."""
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    axes[0, 0].figure.legend(handles, labels, loc="outside lower center", fontsize=8)
+    """Every name once, whichever panels have a line of it."""
+    named: dict[str, Any] = {}
+    for ax in axes.ravel():
+        handles, labels = ax.get_legend_handles_labels()
+        named |= dict(zip(labels, handles, strict=True))
+    figure = axes[0, 0].figure
+    figure.legend(list(named.values()), list(named), loc="outside lower center", fontsize=8)

@@ -11,9 +11,11 @@ calls the second one value-gradient weighting and gives no formula: pulling dV/d
 the decoder's sensitivity is our reading.
 
 For the first two, decoder and critic are differentiated at the drawn one-hot z as if it were
-any vector, h held fixed. The third goes through encoder and posterior of the last step, and
-through the draw of z by the straight-through gradient, that of the probabilities; h does not
-depend on x. Where z is not drawn, it is the gradient itself.
+any vector, h held fixed, along directions that keep the sum of each categorical: J and dV/dz
+are centred there, so a decoder or a critic that ignores z has empty maps. The third goes
+through encoder and posterior of the last step, and through the draw of z by the
+straight-through gradient, that of the probabilities; h does not depend on x. Where z is not
+drawn, it is the gradient itself.
 
 V is the critic's mean, or symlog of it. Images are in [0, 1], decoded vectors in
 symlog. Of the colours of a pixel a map holds the Euclidean norm, which for a single one is the
@@ -33,6 +35,7 @@ from vawm import transforms
 from vawm.agent import Agent, make_agent
 from vawm.analysis import inference
 from vawm.analysis.episodes import Episodes, windows
+from vawm.distributions import on_simplex
 from vawm.envs.protocol import check_positive
 from vawm.errors import InvalidInput
 from vawm.policy import Policy
@@ -96,14 +99,14 @@ def make_saliency(
         observed, (deter, stoch) = gradient(value_after, last)
 
         def decode(stoch: Array) -> PyTree:
-            return world_model.predict(model, state, Latent(deter, stoch)).obs
+            return world_model.predict(model, state, Latent(deter, on_simplex(stoch))).obs
 
         def probe(total: PyTree, key: Key):
             sign = jax.random.rademacher(key, stoch.shape, stoch.dtype)
             return jax.tree.map(lambda t, x: t + jnp.square(x), total, push(sign)), None
 
         # Rows do not meet in any network, so the gradient of the sum is that of each.
-        slope = jax.grad(lambda z: value(params, Latent(deter, z)).sum())(stoch)
+        slope = jax.grad(lambda z: value(params, Latent(deter, on_simplex(z))).sum())(stoch)
         decoded, push = forward(decode, stoch)
         zero = jax.tree.map(jnp.zeros_like, decoded)
         squares, _ = jax.lax.scan(probe, zero, jax.random.split(key_probe, probes))

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from vawm.analysis.curves import aligned
-from vawm.sweep.results import Rows, of_run
+from vawm.sweep.results import Rows, missing, of_run
 from vawm.sweep.runs import Run, Sweep
 
 
@@ -31,8 +31,8 @@ def plot(
       path: of the PNG.
       quantities: columns, a row of panels for each.
       label: of a variant in the legend, with `{}` for its name.
-      seeds: a line for each; or their mean, in a band from the lowest to the highest, over
-        the steps that all of them have.
+      seeds: a line for each; or the mean of those that count in the table, in a band from the
+        lowest to the highest.
       returns: lower and upper end of the axis of returns; as the data need it if None.
     """
     from matplotlib.figure import Figure  # without pyplot, which has a backend of its caller's
@@ -46,7 +46,13 @@ def plot(
         for task, panel in zip(sweep.tasks, line, strict=True):
             for color, variant in enumerate(sweep.variants):
                 owned = [Run(task, variant.name, seed) for seed in sweep.seeds]
-                curves = [of_run(rows, run, quantity) for run in owned]
+                # In a band, a run that is not over would end the others' curve too.
+                left_out = [
+                    run for run in owned if seeds == "band" and missing(sweep, rows, run)
+                ]
+                curves = [
+                    [] if run in left_out else of_run(rows, run, quantity) for run in owned
+                ]
                 draw(panel, curves, quantity, f"C{color}", label.format(variant.name))
             named = quantity.replace("_", " ")
             panel.set(title=task, xlabel="thousand environment steps", ylabel=named)

@@ -54,7 +54,7 @@ def read(sweep: Sweep, columns: Mapping[str, str] = RETURN) -> Rows:
     for run in runs.all_runs(sweep):
         path = runs.folder(sweep, run) / "metrics.jsonl"
         length, reached = runs.env_steps(sweep, run), 0
-        for metrics in tracking.read(path) if path.exists() else ():
+        for metrics in tracking.read(path):
             if length is not None and reached >= length:
                 break
             reached = metrics["env_steps"]
