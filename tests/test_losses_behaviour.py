@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from test_transforms import slow_log_softmax, slow_two_hot
 
 from vawm import losses, transforms
 
@@ -25,10 +26,9 @@ def batch(shape=(4, 3)):
 @pytest.mark.parametrize("slow_scale", [0.0, 1.0, 0.3])
 def test_critic_loss_is_the_sum_of_both_cross_entropies(slow_scale):
     logits, slow_value, target = batch()
-    log_prob = np.asarray(logits, np.float64)
-    log_prob = log_prob - np.log(np.exp(log_prob).sum(-1, keepdims=True))
-    codes = transforms.two_hot(target, BINS), transforms.two_hot(slow_value, BINS)
-    to_returns, to_slow = (-(np.asarray(code) * log_prob).sum(-1) for code in codes)
+    log_prob = slow_log_softmax(logits).reshape(-1, 41)
+    codes = (slow_two_hot(x.ravel(), BINS) for x in (target, slow_value))
+    to_returns, to_slow = (-(code * log_prob).sum(-1).reshape(4, 3) for code in codes)
     actual = critic_loss(logits, slow_value, target, bins=BINS, slow_scale=slow_scale)
     np.testing.assert_allclose(actual, to_returns + slow_scale * to_slow, rtol=1e-5)
 
@@ -60,6 +60,17 @@ def test_critic_loss_refuses_a_bootstrap_value_too_many():
         critic_loss(logits, slow_value, target[:-1], bins=BINS, slow_scale=1.0)
 
 
+@pytest.mark.parametrize("shape", [(), (5,), (4, 3)])
+def test_actor_loss_matches_its_sum(shape):
+    log_prob, entropy, advantage = np.random.default_rng(0).normal(size=(3, *shape))
+    as_float32 = (jnp.asarray(x, jnp.float32) for x in (log_prob, entropy, advantage))
+    actual = np.asarray(jax.jit(losses.actor_loss)(*as_float32, entropy_scale=0.3))
+    assert actual.shape == shape
+    for i in np.ndindex(shape):
+        twin = -advantage[i] * log_prob[i] - 0.3 * entropy[i]
+        np.testing.assert_allclose(actual[i], twin, rtol=1e-5, atol=1e-6)
+
+
 def test_actor_loss_by_hand():
     actual = losses.actor_loss(
         jnp.array([-1.0, -2.0]),
@@ -88,6 +99,18 @@ def test_discount_weights_include_the_start():
     cont = jnp.array([[0.5, 0.0], [0.8, 0.9], [0.0, 0.9]])
     actual = losses.discount_weights(cont)
     np.testing.assert_allclose(actual, [[0.5, 0.0], [0.4, 0.0], [0.0, 0.0]], rtol=1e-6)
+
+
+@pytest.mark.parametrize("shape", [(15,), (6, 2, 3)])
+def test_discount_weights_match_their_product(shape):
+    cont = np.random.default_rng(0).random(shape)
+    actual = np.asarray(jax.jit(losses.discount_weights)(jnp.asarray(cont, jnp.float32)))
+    assert actual.shape == shape
+    for i in np.ndindex(shape):
+        twin = 1.0
+        for t in range(i[0] + 1):
+            twin *= cont[t, *i[1:]]
+        np.testing.assert_allclose(actual[i], twin, rtol=1e-5)
 
 
 def test_discount_weights_have_no_gradient():

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from test_transforms import slow_log_softmax, slow_two_hot
 
 from vawm import losses, transforms
 
@@ -15,16 +16,16 @@ def slow_kl(post_logits, prior_logits, unimix):
     """`[...]` KL of unimixed categoricals, summed over the last two axes."""
 
     def probs(logits):
-        logits = np.asarray(logits, np.float64)
-        p = np.exp(logits - logits.max(-1, keepdims=True))
-        p /= p.sum(-1, keepdims=True)
+        p = np.exp(slow_log_softmax(logits))
         return (1 - unimix) * p + unimix / p.shape[-1]
 
     q, p = probs(post_logits), probs(prior_logits)
     return (q * np.log(q / p)).sum((-2, -1))
 
 
+balanced_kl = jax.jit(losses.balanced_kl, static_argnames="unimix")
 dynamics_loss = jax.jit(losses.dynamics_loss, static_argnames=tuple(KL))
+batch_dynamics_loss = jax.jit(losses.batch_dynamics_loss, static_argnames=tuple(KL))
 prediction_loss = jax.jit(losses.prediction_loss, static_argnames="discount")
 
 
@@ -35,6 +36,58 @@ def logits(scale, shape=(2, 3, 4, 5)):
 def gradients(post, prior, **numbers):
     loss = lambda q, p: dynamics_loss(q, p, **numbers)[0].sum()  # noqa: E731
     return jax.jit(jax.grad(loss, argnums=(0, 1)))(post, prior)
+
+
+@pytest.mark.parametrize("scale", [0.1, 3.0])
+@pytest.mark.parametrize("unimix", [0.0, 0.01, 0.5])
+def test_both_terms_of_the_balance_match_their_twin(scale, unimix):
+    post, prior = logits(scale)
+    for term in balanced_kl(post, prior, unimix=unimix):
+        twin = slow_kl(post, prior, unimix)
+        np.testing.assert_allclose(term, twin, rtol=1e-4, atol=1e-6)
+
+
+def fair_and_loaded():
+    """Three coins each at two states: fair against one in ten, and fair against fair."""
+    post = jnp.zeros((2, 3, 2))
+    return post, post.at[0].set(jnp.log(jnp.array([0.1, 0.9])))
+
+
+# Half of log(5) and half of log(5/9), for each of the three coins.
+THREE_COINS = 3 * 0.5 * (np.log(5) + np.log(5 / 9))
+
+
+def test_balance_by_hand():
+    for term in losses.balanced_kl(*fair_and_loaded(), unimix=0.0):
+        np.testing.assert_allclose(term, [THREE_COINS, 0.0], rtol=1e-6)
+    # Half of the mass mixed in evenly makes of one in ten three in ten.
+    mixed = 3 * 0.5 * (np.log(5 / 3) + np.log(5 / 7))
+    for term in losses.balanced_kl(*fair_and_loaded(), unimix=0.5):
+        np.testing.assert_allclose(term, [mixed, 0.0], rtol=1e-5)
+
+
+@pytest.mark.parametrize(("term", "moved"), [(0, "prior"), (1, "posterior")])
+def test_each_term_of_the_balance_moves_its_own_side(term, moved):
+    loss = lambda q, p: balanced_kl(q, p, unimix=0.01)[term].sum()  # noqa: E731
+    to_post, to_prior = jax.jit(jax.grad(loss, argnums=(0, 1)))(*logits(3.0))
+    to_own, to_other = (to_prior, to_post) if moved == "prior" else (to_post, to_prior)
+    assert (np.abs(to_own).sum(-1) > 0).all()
+    np.testing.assert_array_equal(to_other, np.zeros_like(to_other))
+
+
+def test_balance_refuses_a_prior_of_another_shape():
+    with pytest.raises(AssertionError):
+        losses.balanced_kl(jnp.zeros((2, 3, 4, 5)), jnp.zeros((2, 1, 4, 5)), unimix=0.01)
+
+
+def test_dynamics_losses_by_hand():
+    numbers = KL | {"unimix": 0.0, "free_nats": 0.5}
+    loss, kl = dynamics_loss(*fair_and_loaded(), **numbers)
+    np.testing.assert_allclose(kl, [THREE_COINS, 0.0], rtol=1e-6)
+    np.testing.assert_allclose(loss, [1.1 * THREE_COINS, 1.1 * 0.5], rtol=1e-6)
+    loss, kl = batch_dynamics_loss(*fair_and_loaded(), **numbers)
+    np.testing.assert_allclose(kl, [THREE_COINS, 0.0], rtol=1e-6)
+    np.testing.assert_allclose(loss, 1.1 * THREE_COINS / 2, rtol=1e-6)
 
 
 @pytest.mark.parametrize("scale", [0.1, 3.0, 100.0])
@@ -83,9 +136,6 @@ def test_reported_kl_has_no_gradient():
     kl = lambda q, p: dynamics_loss(q, p, **KL)[1].sum()  # noqa: E731
     for gradient in jax.jit(jax.grad(kl, argnums=(0, 1)))(post, prior):
         np.testing.assert_array_equal(gradient, np.zeros_like(post))
-
-
-batch_dynamics_loss = jax.jit(losses.batch_dynamics_loss, static_argnames=tuple(KL))
 
 
 def batch_gradients(post, prior, **numbers):
@@ -192,45 +242,94 @@ def test_continue_loss_is_least_at_the_target():
     assert gradient == pytest.approx(0.0, abs=1e-6)
 
 
-def predictions(obs_shape):
-    key_obs, key_reward, key_cont = jax.random.split(jax.random.key(0), 3)
+def heads_and_targets(obs):
+    """What heads say of 2 x 3 steps and what was there, some of it terminal."""
+    rng = np.random.default_rng(0)
+    reward = 3 * rng.normal(size=(2, 3))
+    is_terminal = np.array([[False, True, False], [False, False, True]])
     return (
-        jax.random.uniform(key_obs, (2, 3, *obs_shape)),
-        jax.random.normal(key_reward, (2, 3, 41)),
-        jax.random.normal(key_cont, (2, 3)),
-    )
-
-
-def test_prediction_loss_is_its_three_parts():
-    obs, reward_logits, cont_logit = predictions((7,))
-    target = 5 * jax.random.normal(jax.random.key(1), (2, 3, 7))
-    reward = jnp.arange(6.0).reshape(2, 3) - 2
-    is_terminal = jnp.array([[False, True, False], [False, False, True]])
-    loss = prediction_loss(
-        obs, reward_logits, cont_logit, target, reward, is_terminal, bins=BINS, discount=0.9
-    )
-    cont = jnp.where(is_terminal, 0.0, 0.9)
-    np.testing.assert_allclose(loss.reconstruction, losses.symlog_mse(obs, target), rtol=1e-6)
-    np.testing.assert_allclose(
-        loss.reward, transforms.two_hot_cross_entropy(reward_logits, reward, BINS), rtol=1e-6
-    )
-    np.testing.assert_allclose(loss.cont, losses.continue_loss(cont_logit, cont), rtol=1e-5)
-
-
-def test_prediction_loss_compares_images_as_bytes():
-    obs, reward_logits, cont_logit = predictions((4, 4, 3))
-    target = jax.random.randint(jax.random.key(1), (2, 3, 4, 4, 3), 0, 256).astype(jnp.uint8)
-    loss = prediction_loss(
+        jax.tree.map(lambda x: rng.random((2, 3, *x.shape[2:]), np.float32), obs),
+        jnp.asarray(rng.normal(size=(2, 3, 41)), jnp.float32),
+        jnp.asarray(rng.normal(size=(2, 3)), jnp.float32),
         obs,
-        reward_logits,
-        cont_logit,
-        target,
-        jnp.zeros((2, 3)),
-        jnp.zeros((2, 3), bool),
-        bins=BINS,
-        discount=0.9,
+        jnp.asarray(reward, jnp.float32),
+        jnp.asarray(is_terminal),
     )
-    np.testing.assert_allclose(loss.reconstruction, losses.image_mse(obs, target), rtol=1e-6)
+
+
+def observations():
+    rng = np.random.default_rng(1)
+    vector = jnp.asarray(5 * rng.normal(size=(2, 3, 7)), jnp.float32)
+    return vector, jnp.asarray(rng.integers(0, 256, (2, 3, 4, 4, 3)), jnp.uint8)
+
+
+def slow_prediction_loss(predicted, reward_logits, cont_logit, obs, reward, is_terminal):
+    """Reconstruction, reward and continuation of one array, a step at a time; gamma is 0.9."""
+    parts = np.zeros((3, *reward.shape))
+    for i in np.ndindex(reward.shape):
+        o = np.asarray(obs[i], np.float64)
+        o = o / 255 if obs.dtype == np.uint8 else np.sign(o) * np.log1p(np.abs(o))
+        parts[0][i] = ((np.asarray(predicted[i], np.float64) - o) ** 2).sum()
+        code = slow_two_hot(reward[i][None], BINS)[0]
+        parts[1][i] = -code @ slow_log_softmax(reward_logits[i])
+        goes_on = 1 / (1 + np.exp(-np.float64(cont_logit[i])))
+        c = 0.0 if is_terminal[i] else 0.9
+        parts[2][i] = -c * np.log(goes_on) - (1 - c) * np.log(1 - goes_on)
+    return parts
+
+
+@pytest.mark.parametrize("kind", ["vector", "image"])
+def test_prediction_loss_matches_its_twin(kind):
+    vector, image = observations()
+    arrays = heads_and_targets(vector if kind == "vector" else image)
+    actual = prediction_loss(*arrays, bins=BINS, discount=0.9)
+    for part, twin in zip(actual, slow_prediction_loss(*arrays), strict=True):
+        np.testing.assert_allclose(part, twin, rtol=1e-5)
+
+
+def test_prediction_loss_adds_up_what_is_observed():
+    vector, image = observations()
+    arrays = heads_and_targets({"vector": vector, "image": image})
+    actual = prediction_loss(*arrays, bins=BINS, discount=0.9)
+    predicted, rest = arrays[0], (arrays[1], arrays[2])
+    apart = [
+        slow_prediction_loss(predicted[k], *rest, obs, *arrays[4:])[0]
+        for k, obs in (("vector", vector), ("image", image))
+    ]
+    np.testing.assert_allclose(actual.reconstruction, sum(apart), rtol=1e-5)
+
+
+def test_prediction_loss_by_hand():
+    bins = jnp.array([-1.0, 0.0, 1.0])
+    loss = losses.prediction_loss(
+        jnp.array([[1.0, 0.0]]),
+        jnp.log(jnp.array([[0.25, 0.25, 0.5]])),
+        jnp.array([jnp.log(3.0)]),
+        jnp.array([[np.e - 1, np.e**2 - 1]]),
+        jnp.array([0.5]),
+        jnp.array([False]),
+        bins=bins,
+        discount=0.8,
+    )
+    np.testing.assert_allclose(loss.reconstruction, [4.0], rtol=1e-6)
+    np.testing.assert_allclose(loss.reward, [0.5 * np.log(4) + 0.5 * np.log(2)], rtol=1e-6)
+    np.testing.assert_allclose(loss.cont, [0.8 * np.log(4 / 3) + 0.2 * np.log(4)], rtol=1e-6)
+
+
+def test_each_part_of_the_prediction_loss_moves_its_own_head_and_no_target():
+    vector, _ = observations()
+    *floats, is_terminal = heads_and_targets(vector)
+
+    def parts(*floats):
+        loss = prediction_loss(*floats, is_terminal, bins=BINS, discount=0.9)
+        return jax.tree.map(jnp.sum, loss)
+
+    routes = jax.jit(jax.jacobian(parts, argnums=(0, 1, 2, 4)))(*floats)
+    for own, route in enumerate(routes):
+        *to_heads, to_reward = route
+        for head, gradient in enumerate(to_heads):
+            assert (gradient != 0).any() == (head == own)
+        np.testing.assert_array_equal(to_reward, np.zeros((2, 3)))
 
 
 @pytest.mark.parametrize(
@@ -245,27 +344,17 @@ def test_prediction_loss_compares_images_as_bytes():
     ids=["whole numbers", "images of floats", "another time", "no batch", "another tree"],
 )
 def test_prediction_loss_refuses_observations_that_are_not_one_for_each_state(obs):
-    _, reward_logits, cont_logit = predictions((7,))
+    _, *logits, _, reward, is_terminal = heads_and_targets(observations()[0])
     predicted = obs["vector"] if isinstance(obs, dict) else obs
-    rest = jnp.zeros((2, 3)), jnp.zeros((2, 3), bool)
     with pytest.raises(AssertionError):
-        prediction_loss(
-            predicted, reward_logits, cont_logit, obs, *rest, bins=BINS, discount=0.9
-        )
+        prediction_loss(predicted, *logits, obs, reward, is_terminal, bins=BINS, discount=0.9)
 
 
 def test_prediction_loss_refuses_rewards_of_another_time():
-    obs, reward_logits, cont_logit = predictions((7,))
+    *heads_and_obs, reward, is_terminal = heads_and_targets(observations()[0])
     with pytest.raises(AssertionError):
         prediction_loss(
-            obs,
-            reward_logits,
-            cont_logit,
-            obs,
-            jnp.zeros((2, 2)),
-            jnp.zeros((2, 2), bool),
-            bins=BINS,
-            discount=0.9,
+            *heads_and_obs, reward[:, 1:], is_terminal[:, 1:], bins=BINS, discount=0.9
         )
 
 

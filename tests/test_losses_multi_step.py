@@ -172,6 +172,29 @@ def test_scaled_gradients_leave_what_they_scale_exactly_as_it_is():
     np.testing.assert_allclose(pullback(jnp.arange(40.0))[0], 0.3 * np.arange(40), rtol=1e-6)
 
 
+def test_gradients_pass_through_n_step_returns():
+    reward, discount, value = jnp.array([1.0, 2.0]), jnp.array([0.5, 0.25]), jnp.ones(2)
+    first = lambda *x: n_step_returns(*x, steps=2)[0]  # noqa: E731
+    to_reward, to_discount, to_value = jax.grad(first, argnums=(0, 1, 2))(
+        reward, discount, value
+    )
+    # y_0 = r_1 + d_1 (r_2 + d_2 v_2)
+    np.testing.assert_allclose(to_reward, [1.0, 0.5])
+    np.testing.assert_allclose(to_discount, [2.25, 0.5])
+    np.testing.assert_allclose(to_value, [0.0, 0.125])
+
+
+@pytest.mark.parametrize("shape", [(7,), (4, 3, 7)])
+def test_consistency_matches_its_sum(shape):
+    prediction, target = np.random.default_rng(0).normal(size=(2, *shape))
+    as_float32 = (jnp.asarray(x, jnp.float32) for x in (prediction, target))
+    actual = np.asarray(jax.jit(losses.latent_consistency_loss)(*as_float32))
+    assert actual.shape == shape[:-1]
+    for i in np.ndindex(shape[:-1]):
+        twin = sum((p - t) ** 2 for p, t in zip(prediction[i], target[i], strict=True))
+        np.testing.assert_allclose(actual[i], twin, rtol=1e-5)
+
+
 def test_consistency_is_the_squared_distance_and_stops_its_target():
     prediction, target = (
         jnp.array([[1.0, 2.0], [0.0, 0.0]]),

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from test_transforms import slow_log_softmax
 
 from vawm import losses
 
@@ -11,12 +12,6 @@ SCALES = {"dynamics_scale": 0.5, "representation_scale": 0.1}
 
 
 value_alignment_loss = jax.jit(losses.value_alignment_loss, static_argnames=tuple(SCALES))
-
-
-def slow_log_softmax(logits):
-    logits = np.asarray(logits, np.float64)
-    shifted = logits - logits.max(-1, keepdims=True)
-    return shifted - np.log(np.exp(shifted).sum(-1, keepdims=True))
 
 
 def pair(shape=(2, 3, 41)):

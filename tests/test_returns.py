@@ -88,6 +88,18 @@ def test_lambda_zero_is_one_step_temporal_difference():
     np.testing.assert_allclose(actual, [3.0, 6.0])
 
 
+def test_gradients_pass_through_lambda_returns():
+    reward, discount, value = jnp.array([1.0, 2.0]), jnp.array([0.5, 0.25]), jnp.array([4.0, 8])
+    first = lambda *x: returns.lambda_returns(*x, lambda_=0.5)[0]  # noqa: E731
+    to_reward, to_discount, to_value = jax.grad(first, argnums=(0, 1, 2))(
+        reward, discount, value
+    )
+    # R_0 = r_1 + d_1 (v_1 / 2 + R_1 / 2), R_1 = r_2 + d_2 v_2 = 4
+    np.testing.assert_allclose(to_reward, [1.0, 0.25])
+    np.testing.assert_allclose(to_discount, [4.0, 2.0])
+    np.testing.assert_allclose(to_value, [0.25, 0.0625])
+
+
 def test_lambda_returns_refuse_shapes_that_would_broadcast():
     with pytest.raises(AssertionError):
         returns.lambda_returns(
