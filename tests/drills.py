@@ -448,6 +448,8 @@ def fuzz(folder: pathlib.Path, count: int = 2000) -> Outcome:
         if accepted % 100 == 1:
             fuzzing.run(config)
             run += 1
+        if accepted % 20 == 0:
+            jax.clear_caches()  # what is traced is kept: 2,000 configs would fill the memory
 
     one()
     assert not (folder / "nowhere").exists()
