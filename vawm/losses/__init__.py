@@ -35,8 +35,8 @@ The value-aware family:
 The critic is the caller's to stop, except for `muzero_value_loss`, which trains it, and
 `tempo_meta_gradient`, which differentiates by the weights alone.
 
-What docstrings cite. Equation numbers without a name are those of the paper that this package
-is about; where one of these has no number, the equation is as we know it, not as printed there.
+What docstrings cite. Equation numbers are those of the paper that this package is about; of
+what is listed here equations are as we know them, not as printed there.
 
     Farahmand et al., 2017      Value-Aware Loss Function for Model-based Reinforcement Learning
     Farahmand, 2018             Iterative Value-Aware Model Learning

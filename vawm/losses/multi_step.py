@@ -35,7 +35,7 @@ def lambda_ac_loss(prediction_values: Array, target_values: Array, mask: Array) 
 
 
 def muzero_value_loss(values: Array, returns: Array, mask: Array) -> Array:
-    """Value loss of MuZero (Schrittwieser et al., 2020, in Eq. 1), with squared errors.
+    """Value loss of MuZero (Schrittwieser et al., 2020), with squared errors.
 
         L = mask_0 (v_0 - sg y_0)^2 + 1/K sum_{k=1..K} mask_k (v_k - sg y_k)^2
 
