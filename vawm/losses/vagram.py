@@ -13,7 +13,7 @@ Value = Callable[[Array], Array]
 
 
 def vagram_loss(value: Value, prediction: Array, target: Array) -> Array:
-    """Value-gradient-weighted squared error (Voelcker et al., 2022, Eq. 7), diagonal form.
+    """Value-gradient-weighted squared error (Voelcker et al., 2022), diagonal form.
 
         L = sum_j (dV/dx_j)^2 e_j^2,    e = prediction - sg(x),    dV/dx at sg(x)
 
@@ -94,11 +94,12 @@ def vagram_second_order_loss(value: Value, prediction: Array, target: Array) -> 
 
 
 def vagram_joint_loss(value: Value, prediction: Array, target: Array) -> Array:
-    """Second order with the diagonal first term, derived here: no cancelling between dims.
+    """Second order with the diagonal first term: `joint` of the code of Voelcker et al., 2022.
 
         L = 2 sum_j g_j^2 e_j^2 + 1/2 |H e|^2
 
-    With n the size of x, by Cauchy-Schwarz in both terms,
+    Errors in different dims do not cancel in the first term. With n the size of x, by
+    Cauchy-Schwarz in both terms (derived here)
 
         max(n, |e|^2) L  >=  (g . e + 1/2 e' H e)^2
 
