@@ -216,7 +216,7 @@ def categorical_kl(p_logits: Array, q_logits: Array) -> Array:
       q_logits: `[..., K]`, normalised or not.
 
     Returns:
-      `[...]` in nats, in float32; exactly 0 for equal logits. Nothing is stopped.
+      `[...]` in nats, in float32; exactly 0 for equal finite logits. Nothing is stopped.
 
     Raises:
       AssertionError: the shapes differ.

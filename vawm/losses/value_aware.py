@@ -105,7 +105,8 @@ def categorical_iter_vaml_loss(prediction_logits: Array, target_logits: Array) -
         L = -sum_k sg v_k(x') log v_k(x^)
 
     This is the first term of `value_alignment_loss`, KL[sg v(x') || v(x^)], plus the entropy
-    of the target: it is not 0 where both are equal, and has the same gradient.
+    of the target: it is not 0 where both are equal, and has the same gradient. In that code
+    the target critic gives both logits.
 
     Args:
       prediction_logits: `[..., bins]` critic logits at the model's next state.
