@@ -119,10 +119,6 @@ def rows(name: str, trajectories: Trajectories) -> list[dict[str, Any]]:
     ]
 
 
-def has_images(trajectories: Trajectories) -> bool:
-    return any(is_image(leaf) for leaf in jax.tree.leaves(trajectories.truth))
-
-
 def film(trajectories: Trajectories) -> np.ndarray:
     """`[T, H, W, 3]` uint8: truth, imagination and difference one above the other.
 
