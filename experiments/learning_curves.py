@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 from vawm import command_line, flags, validate
+from vawm.analysis.tables import write_csv
 from vawm.config import ValueAlignmentConfig
 from vawm.sweep import children, figures, results, runs
 from vawm.sweep.runs import PROGRAMS, Sweep, Variant
@@ -113,7 +114,7 @@ def check(options: Options, sweep: Sweep) -> None:
 
 def write(rows: results.Rows, options: Options, sweep: Sweep) -> None:
     options.results.mkdir(parents=True, exist_ok=True)
-    results.write_csv(rows, options.result("csv"), results.headings("alignment"))
+    write_csv(results.headed(rows, "alignment"), options.result("csv"))
     figures.plot(
         rows,
         sweep,

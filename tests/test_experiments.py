@@ -166,7 +166,7 @@ def test_a_run_that_failed_is_named_and_half_a_line_survived(options, monkeypatc
     table = options.result("csv").read_text().splitlines()
     assert table == [
         "task,alignment,seed,env_steps,updates,minutes,return",
-        "cartpole_balance,off,0,8,1,1.0,12.3",
+        "cartpole_balance,off,0,8,1,1,12.3",
     ]
     assert options.result("png").stat().st_size
 

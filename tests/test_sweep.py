@@ -13,6 +13,7 @@ import pytest
 import tiny
 
 from vawm import command_line, rundir
+from vawm.analysis import tables
 from vawm.errors import InvalidInput
 from vawm.sweep import children, figures, results, runs
 from vawm.sweep.runs import Run, Sweep, Variant
@@ -284,7 +285,7 @@ def test_columns_are_written_in_order_under_their_headings(finished, tmp_path):
     path = tmp_path / "table.csv"
     columns = results.RETURN | {"loss": "loss"}
     rows = results.read(sweep, columns)[1:2]
-    results.write_csv(rows, path, results.headings("behaviour", columns))
+    tables.write_csv(results.headed(rows, "behaviour"), path)
     assert path.read_text() == (
         "task,behaviour,seed,env_steps,updates,minutes,return,loss\n"
         "a/b,finish,0,64,8,6.4,,0.33333\n"

@@ -16,6 +16,7 @@ from typing import Literal, NamedTuple
 
 from vawm import config as config_lib
 from vawm import flags, validate
+from vawm.analysis.tables import write_csv
 from vawm.sweep import children, figures, results, runs
 from vawm.sweep.runs import PROGRAMS, Sweep, Variant
 
@@ -197,7 +198,7 @@ def write(ablation: Ablation, options: Options, sweep: Sweep, made_by: str) -> s
     rows = results.read(sweep, columns)
     options.results.mkdir(parents=True, exist_ok=True)
     path = options.results / result_name(ablation, options)
-    results.write_csv(rows, path.with_suffix(".csv"), results.headings("variant", columns))
+    write_csv(rows, path.with_suffix(".csv"))
     table = results.markdown(
         results.summarise(sweep, rows, columns),
         factor=ablation.factor,

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import csv
 import itertools
 import math
-import pathlib
 import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -185,15 +183,6 @@ def line(cells: Sequence[str]) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
-def write_csv(rows: Rows, path: pathlib.Path, columns: Mapping[str, str]) -> None:
-    """Writes `rows`; `columns` are column -> heading, in the order of the file."""
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(columns.values())
-        writer.writerows([row[name] for name in columns] for row in rows)
-
-
-def headings(factor: str, columns: Mapping[str, str] = RETURN) -> dict[str, str]:
-    """Column -> heading of the rows of `read`; that of the variant is `factor`."""
-    names = ("task", "variant", "seed", "env_steps", "updates", "minutes", *columns)
-    return {name: factor if name == "variant" else name for name in names}
+def headed(rows: Rows, factor: str) -> Rows:
+    """The rows of `read` with `factor` for "variant"."""
+    return [{{"variant": factor}.get(name, name): row[name] for name in row} for row in rows]
