@@ -217,9 +217,9 @@ def test_a_table_of_nothing_says_so(tmp_path):
 def test_the_error_is_that_of_the_mean_and_none_for_a_single_run():
     values = [812.0, 790.5, 801.25]
     error = np.std(values, ddof=1) / np.sqrt(3)
-    assert results.mean_and_error(values) == f"{np.mean(values):.1f} +- {error:.1f}"
-    assert results.mean_and_error(values[:1]) == "812.0"
-    assert results.mean_and_error([]) == "-"
+    assert results.with_error(values) == f"{np.mean(values):.1f} +- {error:.1f}"
+    assert results.with_error(values[:1]) == "812.0"
+    assert results.with_error([]) == "-"
 
 
 @pytest.mark.parametrize("count", [2, 3, 20])

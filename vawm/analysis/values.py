@@ -360,7 +360,7 @@ def mean_over(error: np.ndarray, mask: np.ndarray) -> np.ndarray:
 
 
 def mean_and_error(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean over the rows that are not NaN, and its standard error; `[E, K]` -> two `[K]`."""
+    """Mean over rows `[E, ...]` that are not NaN, and its standard error, both `[...]`."""
     there = ~np.isnan(values)
     count = there.sum(0)
     mean = np.where(there, values, 0.0).sum(0) / np.where(count, count, np.nan)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import itertools
-import math
 import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from vawm import tracking
+from vawm.analysis.values import mean_and_error
 from vawm.sweep import runs
 from vawm.sweep.runs import Run, Sweep
 
@@ -138,16 +140,13 @@ def summarise(sweep: Sweep, rows: Rows, columns: Mapping[str, str] = RETURN) -> 
     return summaries
 
 
-def mean_and_error(values: Sequence[float]) -> str:
-    """Mean and its standard error: sample deviation / sqrt(n), which a single value has not."""
+def with_error(values: Sequence[float]) -> str:
+    """Mean and its standard error, which a single value has not."""
     if not values:
         return "-"
-    mean = statistics.mean(values)
+    mean, error = mean_and_error(np.asarray(values))
     style = ".1f" if abs(mean) >= 10 else ".3g"
-    if len(values) == 1:
-        return format(mean, style)
-    error = statistics.stdev(values) / math.sqrt(len(values))
-    return f"{mean:{style}} +- {error:{style}}"
+    return f"{mean:{style}}" if np.isnan(error) else f"{mean:{style}} +- {error:{style}}"
 
 
 def markdown(summaries: Sequence[Summary], *, factor: str, command: str, notes: str) -> str:
@@ -167,7 +166,7 @@ def markdown(summaries: Sequence[Summary], *, factor: str, command: str, notes: 
         count = f"{total}" if not s.missing else f"**{len(s.seeds)} of {total}**"
         measured = [s.last, s.best, s.area, *s.late.values()]
         minutes = f"{statistics.mean(s.minutes):.1f}" if s.minutes else "-"
-        cells = [s.task, s.variant, count, *map(mean_and_error, measured), minutes]
+        cells = [s.task, s.variant, count, *map(with_error, measured), minutes]
         lines.append(line(cells))
     lines.append("")
     for s in summaries:
