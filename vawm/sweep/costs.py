@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from vawm import flags, overhead
+from vawm.analysis.figures import panels
 from vawm.analysis.tables import write_csv
 from vawm.envs.protocol import check_positive
 from vawm.overhead import Measured, percent_more, quartiles
@@ -122,23 +123,19 @@ def markdown(rows: Rows, *, notes: str, command: str) -> str:
 
 def plot(rows: Rows, sweep: Sweep, path: pathlib.Path) -> None:
     """Seconds of a sample, with quartiles, and peak memory: a group of bars per task."""
-    from matplotlib.figure import Figure  # without pyplot, which has a backend of its caller's
-
-    figure = Figure(figsize=(9, 3.2))
-    time, memory = figure.subplots(1, 2)
     width, places = 0.8 / len(sweep.variants), range(len(sweep.tasks))
-    for number, variant in enumerate(sweep.variants):
-        own = [row for row in rows if row["variant"] == variant.name]
-        at = [place + number * width for place in places]
-        below = [row["seconds"] - row["seconds_first_quartile"] for row in own]
-        above = [row["seconds_third_quartile"] - row["seconds"] for row in own]
-        seconds = [row["seconds"] for row in own]
-        time.bar(at, seconds, width, yerr=(below, above), label=variant.name)
-        memory.bar(at, [row["peak_gib"] for row in own], width, label=variant.name)
-    for panel, what in ((time, "seconds of a sample"), (memory, "peak memory, GiB")):
-        middle = width * (len(sweep.variants) - 1) / 2
-        panel.set_xticks([place + middle for place in places], sweep.tasks)
-        panel.set(ylabel=what)
-    time.legend(title="value alignment")
-    figure.tight_layout()
-    figure.savefig(path, dpi=110)
+    with panels(path, 1, 2, size=(4.5, 3.2)) as axes:
+        time, memory = axes[0]
+        for number, variant in enumerate(sweep.variants):
+            own = [row for row in rows if row["variant"] == variant.name]
+            at = [place + number * width for place in places]
+            below = [row["seconds"] - row["seconds_first_quartile"] for row in own]
+            above = [row["seconds_third_quartile"] - row["seconds"] for row in own]
+            seconds = [row["seconds"] for row in own]
+            time.bar(at, seconds, width, yerr=(below, above), label=variant.name)
+            memory.bar(at, [row["peak_gib"] for row in own], width, label=variant.name)
+        for panel, what in ((time, "seconds of a sample"), (memory, "peak memory, GiB")):
+            middle = width * (len(sweep.variants) - 1) / 2
+            panel.set_xticks([place + middle for place in places], sweep.tasks)
+            panel.set(ylabel=what)
+        time.legend(title="value alignment")

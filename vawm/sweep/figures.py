@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import pathlib
 from collections.abc import Sequence
 from typing import Literal
@@ -9,6 +10,7 @@ from typing import Literal
 import numpy as np
 
 from vawm.analysis.curves import aligned
+from vawm.analysis.figures import panels
 from vawm.sweep.results import Rows, missing, of_run
 from vawm.sweep.runs import Run, Sweep
 
@@ -35,15 +37,11 @@ def plot(
         lowest to the highest.
       returns: lower and upper end of the axis of returns; as the data need it if None.
     """
-    from matplotlib.figure import Figure  # without pyplot, which has a backend of its caller's
-
-    width, height = len(sweep.tasks), len(quantities)
-    size = (4.5 * width, 3.2 * height)
-    figure = Figure(figsize=size)
-    panels = figure.subplots(height, width, squeeze=False)
     draw = {"lines": _lines, "band": _band}[seeds]
-    for quantity, line in zip(quantities, panels, strict=True):
-        for task, panel in zip(sweep.tasks, line, strict=True):
+    with panels(path, len(quantities), len(sweep.tasks), size=(4.5, 3.2)) as axes:
+        for (quantity, task), ax in zip(
+            itertools.product(quantities, sweep.tasks), axes.ravel(), strict=True
+        ):
             for color, variant in enumerate(sweep.variants):
                 owned = [Run(task, variant.name, seed) for seed in sweep.seeds]
                 # In a band, a run that is not over would end the others' curve too.
@@ -53,16 +51,14 @@ def plot(
                 curves = [
                     [] if run in left_out else of_run(rows, run, quantity) for run in owned
                 ]
-                draw(panel, curves, quantity, f"C{color}", label.format(variant.name))
+                draw(ax, curves, quantity, f"C{color}", label.format(variant.name))
             named = quantity.replace("_", " ")
-            panel.set(title=task, xlabel="thousand environment steps", ylabel=named)
+            ax.set(title=task, xlabel="thousand environment steps", ylabel=named)
             if seeds == "band":
-                panel.legend()
+                ax.legend()
             if quantity == "return" and returns is not None:
-                panel.set_ylim(*returns)
-    panels[0][0].legend()
-    figure.tight_layout()
-    figure.savefig(path, dpi=110)
+                ax.set_ylim(*returns)
+        axes[0, 0].legend()
 
 
 def _lines(panel, curves: Sequence[Rows], quantity: str, color: str, label: str) -> None:
