@@ -57,14 +57,16 @@ def make_value_alignment(agent: Agent, config: Config) -> Callable[..., Alignmen
     world model through the latents, or only through z where `deter_gradient` is "stop".
     """
     alignment = config.value_alignment
+    adaptive = functools.partial(
+        losses.value_alignment_weight, warmup_steps=alignment.warmup_steps
+    )
 
     def weight_of(kl: Array, step: Array) -> Array:
         if alignment.weight == "off":
             return jnp.zeros_like(kl)
-        if alignment.weight == "static":
-            gate = (step > alignment.warmup_steps).astype(kl.dtype)
-            return jnp.full_like(kl, alignment.static_weight) * gate
-        return losses.value_alignment_weight(kl, step, warmup_steps=alignment.warmup_steps)
+        if alignment.weight == "static":  # where the KL is 0 only the warm-up is left of Eq. 5
+            return alignment.static_weight * adaptive(jnp.zeros_like(kl), step)
+        return adaptive(kl, step)
 
     def value_alignment(
         critic: PyTree, inference: Inference, kl: Array, step: Array
