@@ -5,6 +5,7 @@ import math
 
 import pytest
 import tiny
+import tiny_storm
 
 from vawm import config as config_lib
 from vawm import presets, validate
@@ -101,6 +102,8 @@ def test_every_rule_is_about_a_field():
         ("value_alignment.weight", "none", "use one of adaptive, static, off"),
         ("world_model.deter", 30, "multiple of world_model.blocks=4"),
         ("world_model.classes", 257, "from 2 to 256"),
+        ("world_model.decoder_layers", 1_000_000, "from 1 to 100"),
+        ("actor.layers", 101, "from 1 to 100"),
         ("critic.bins", 40, "odd number"),
         ("critic.slow_rate", 1.5, "up to 1"),
         ("imagination.lambda_", 1.01, "from 0 to 1"),
@@ -126,6 +129,17 @@ def test_bad_values_come_with_a_remedy(name, value, remedy):
 
 def test_the_number_of_environments_that_is_named_fits():
     validate.check(tiny.config(num_envs=5))
+
+
+@pytest.mark.parametrize(
+    "config", [tiny.CONFIG, tiny_storm.CONFIG], ids=lambda config: config.agent
+)
+def test_every_number_of_layers_is_bounded(config):
+    names = (name for name, _ in validate.values(config))
+    depths = [name for name in names if name.endswith(("layers", "blocks"))]
+    assert len(depths) > 3
+    for name in depths:
+        assert validate.RULES[name] is validate.LAYERS
 
 
 @pytest.mark.parametrize(
