@@ -392,6 +392,7 @@ def fill(disk: pathlib.Path, save_every: int) -> str:
     told = [line for line in output.splitlines() if "No space left" in line]
     assert len(told) == 1, output[-2000:]
     assert re.match(rf"(checkpoint )?{logdir}", told[0]), told
+    assert " free)" in told[0], told
     scratch = list(checkpoint.root(logdir).glob(f"{checkpoint.SCRATCH}*"))
     assert not scratch, scratch
     newest = checkpoint.latest(logdir)

@@ -5,6 +5,7 @@ import io
 import json
 import math
 import os
+import re
 import shutil
 import signal
 import time
@@ -402,7 +403,8 @@ def test_a_full_disk_is_explained_in_one_line(tmp_path, fake, monkeypatch, broke
     monkeypatch.setattr(f"vawm.{broken}", full)
     with pytest.raises(runner.RunError) as error:
         run(tiny.CONFIG, tmp_path)
-    assert str(error.value).startswith(f"{tmp_path}: No space left on device; ")
+    told = rf"{tmp_path}: No space left on device \([\d.]+ \w+ free\); "
+    assert re.match(told, str(error.value))
     assert "\n" not in str(error.value)
 
 

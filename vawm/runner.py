@@ -8,6 +8,7 @@ the host's `Progress`, with the interval since the last line of metrics. A resum
 from __future__ import annotations
 
 import contextlib
+import errno
 import functools
 import pathlib
 import time
@@ -372,8 +373,10 @@ def _explained(logdir: pathlib.Path):
         remedy = "to begin a new episode instead, start with --env.on-failure restart"
         raise RunError(f"{error}; kept: {checkpoint.kept(logdir)}; {remedy}") from error
     except OSError as error:
+        full = error.errno == errno.ENOSPC
+        free = f" ({checkpoint.free_space(logdir)} free)" if full else ""
         raise RunError(
-            f"{error.filename or logdir}: {error.strerror or error}; "
+            f"{error.filename or logdir}: {error.strerror or error}{free}; "
             "put that right, then go on with --resume or start again"
         ) from error
 

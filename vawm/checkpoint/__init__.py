@@ -47,7 +47,7 @@ from vawm.checkpoint.reading import (
 )
 from vawm.checkpoint.saver import Saver
 from vawm.checkpoint.snapshot import Snapshot, take
-from vawm.checkpoint.writing import SaveError, Written, save, write
+from vawm.checkpoint.writing import SaveError, Written, free_space, save, write
 
 __all__ = [
     "ACTING",
@@ -61,6 +61,7 @@ __all__ = [
     "complete",
     "find",
     "flatten",
+    "free_space",
     "kept",
     "latest",
     "read_agent",

@@ -132,15 +132,19 @@ def _why_not_saved(
     reason = (str(error).strip() or repr(error)).splitlines()[0]
     # TensorStore names file after file before what the system said, and its choices after.
     reason = re.split(r" \[\w+='", reason)[0].rpartition('": ')[-1]
-    try:
-        free = amount(shutil.disk_usage(final.parents[1]).free)
-    except OSError:
-        free = "an unknown amount"
     return (
-        f"checkpoint {final} could not be written (up to {amount(needed)} needed, {free} "
-        f"free): {reason[:200]}; kept: {folders.kept(logdir)}; put that right, then go on "
-        "with --resume"
+        f"checkpoint {final} could not be written (up to {amount(needed)} needed, "
+        f"{free_space(final.parents[1])} free): {reason[:200]}; kept: {folders.kept(logdir)}; "
+        "put that right, then go on with --resume"
     )
+
+
+def free_space(folder: str | os.PathLike[str]) -> str:
+    """On the disk of `folder`, for people."""
+    try:
+        return amount(shutil.disk_usage(folder).free)
+    except OSError:
+        return "an unknown amount"
 
 
 def amount(nbytes: int) -> str:
