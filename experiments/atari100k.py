@@ -1,4 +1,4 @@
-"""Value-aligned DreamerV3 or STORM on the 26 games of Atari 100k.
+"""Train DreamerV3, STORM or VaGraM on the 26 games of Atari 100k.
 
     python experiments/atari100k.py --game breakout                  # small, on a CPU
     python experiments/atari100k.py --game krull --preset paper      # 100k steps, on a GPU

@@ -1,4 +1,4 @@
-"""Value-aligned DreamerV3 or STORM on the DeepMind Control Suite, from proprioception.
+"""Train DreamerV3, STORM or VaGraM on the DeepMind Control Suite, from proprioception.
 
     python experiments/dmc_proprio.py                                # minutes on a CPU
     python experiments/dmc_proprio.py --task walker_walk --preset paper        # on a GPU

@@ -1,4 +1,4 @@
-"""Value-aligned DreamerV3 or STORM on the DeepMind Control Suite, from pixels.
+"""Train DreamerV3, STORM or VaGraM on the DeepMind Control Suite, from pixels.
 
     python experiments/dmc_vision.py                                 # small, on a CPU
     python experiments/dmc_vision.py --task walker_walk --preset paper         # on a GPU

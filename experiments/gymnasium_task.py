@@ -1,4 +1,4 @@
-"""Value-aligned DreamerV3 or STORM on any registered Gymnasium environment.
+"""Train DreamerV3, STORM or VaGraM on any registered Gymnasium environment.
 
     python experiments/gymnasium_task.py --task CartPole-v1
 

@@ -106,11 +106,14 @@ def test_elsewhere_every_line_of_metrics_is_a_line(clock):
     shown = console(clock, terminal=False)
     with Display(shown, start=0, total=10_000) as display:
         display.note("compiling [1/2] ...")
+        display.log(line(1_000, None) | {"updates": 0})
         play(display, clock, seconds=3.0)
         display.log(line(4_000, 12.34))
         display.log(line(10_016, None))
     assert shown.file.getvalue().strip().splitlines() == [
         "compiling [1/2] ...",
+        "env_steps 1000/10000  updates 0  return -  100 steps/s  2.5 updates/s  "
+        "not learning yet",
         "env_steps 4000/10000  updates 30  return 12.3  100 steps/s  2.5 updates/s  1 min left",
         "env_steps 10016/10000  updates 30  return -  100 steps/s  2.5 updates/s  0 min left",
     ]

@@ -41,6 +41,7 @@ def test_a_score_has_mean_and_standard_error():
     assert score.standard_error == pytest.approx(math.sqrt(7 / 3))
     assert str(score) == "3.0 +- 1.5 over 3 episodes"
     assert math.isnan(Score((1.0,)).standard_error)
+    assert str(Score((1.0,))) == "1.0 over 1 episode"
 
 
 @pytest.mark.parametrize(("action", "expected"), [(0.5, 4.0), (0.0, 0.0), (9.0, 0.0)])

@@ -50,10 +50,12 @@ class Display:
             return
         shown = "-" if latest is None else f"{latest:.1f}"
         remaining = max(0, self._total - line["env_steps"]) / max(line["env_steps_per_s"], 1e-9)
+        # Steps are slower by far once there is something to learn from.
+        left = f"{remaining / 60:.0f} min left" if line["updates"] else "not learning yet"
         self._console.print(
             f"env_steps {line['env_steps']}/{self._total}  updates {line['updates']}  "
             f"return {shown}  {line['env_steps_per_s']:.0f} steps/s  "
-            f"{line['updates_per_s']:.1f} updates/s  {remaining / 60:.0f} min left",
+            f"{line['updates_per_s']:.1f} updates/s  {left}",
             highlight=False,
             soft_wrap=True,
         )

@@ -51,6 +51,8 @@ class Score(NamedTuple):
 
     def __str__(self) -> str:
         count = len(self.returns)
+        if count == 1:
+            return f"{self.mean:.1f} over 1 episode"
         return f"{self.mean:.1f} +- {self.standard_error:.1f} over {count} episodes"
 
 

@@ -26,7 +26,8 @@ def check_new(logdir: pathlib.Path) -> None:
     """
     check_writable(logdir)
     if logdir.is_dir() and any(path.name != LOCK for path in logdir.iterdir()):
-        remedy = "exists; continue that run with --resume or choose another --logdir"
+        others = "start over with --fresh or choose another --logdir"
+        remedy = f"exists; continue that run with --resume, {others}"
         raise InvalidInput("logdir", str(logdir), remedy)
 
 

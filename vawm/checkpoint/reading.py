@@ -64,11 +64,9 @@ def find(logdir: str | os.PathLike[str], items: Collection[str] | None = None) -
     if damaged:
         first = damaged[0][1]
         raise Damaged(first.path, f"{first.how}; and no older checkpoint is whole")
-    raise InvalidInput(
-        "logdir",
-        str(logdir),
-        "holds no checkpoint; name the folder of a run that saved one",
-    )
+    state = "holds no checkpoint" if os.path.isdir(logdir) else "is not there"
+    remedy = f"{state}; name the folder of a run that saved one"
+    raise InvalidInput("logdir", str(logdir), remedy)
 
 
 def warning(found: Found) -> str | None:
