@@ -114,6 +114,7 @@ def test_a_run_gets_a_folder_of_its_own():
         (["--replay.capacity", "100"], "replay.capacity=100: use at least"),
         (["--resume"], "logdir=None: --resume needs the --logdir"),
         (["--resume", "--logdir", "nowhere"], "logdir='nowhere': is not there"),
+        (["--resume", "--logdir", "file"], "logdir='file': holds no checkpoint"),
         (["--logdir", "."], "logdir='.': exists"),
         (["--logdir", "file/run"], "logdir='file/run': is not writable"),
         (["--env-step", "5"], "--env-step='5': no such flag; did you mean --env-steps?"),

@@ -32,12 +32,9 @@ ABOVE_ONE: Rule = (lambda x: x > 1, "use a number above 1")
 BINS: Rule = (lambda x: x >= 3 and x % 2 == 1, "use an odd number of at least 3")
 SEQUENCE: Rule = (lambda x: x >= 2, "use a number of at least 2")
 CLASSES: Rule = (lambda x: 2 <= x <= 256, "use a number from 2 to 256")
-# Each layer is built and compiled on its own: a million would take the machine's memory.
+# Each layer, and each block of a transformer, is built and compiled on its own: a million would
+# take the machine's memory.
 LAYERS: Rule = (lambda x: 1 <= x <= 100, "use a number from 1 to 100")
-DEPTHS = (
-    *("blocks", "prior_layers", "encoder_layers", "decoder_layers", "reward_layers"),
-    *("continue_layers", "vector_layers", "head_layers"),
-)
 
 RULES: dict[str, Rule] = {
     "seed": (lambda x: 0 <= x < 2**32, "use a number from 0 to 4294967295"),
@@ -52,7 +49,14 @@ RULES: dict[str, Rule] = {
     "world_model.representation_scale": NOT_NEGATIVE,
     "world_model.value_gradient_scale": NOT_NEGATIVE,
     "world_model.dropout": BELOW_ONE,
-    **{f"world_model.{name}": LAYERS for name in DEPTHS},
+    "world_model.blocks": LAYERS,
+    "world_model.prior_layers": LAYERS,
+    "world_model.encoder_layers": LAYERS,
+    "world_model.decoder_layers": LAYERS,
+    "world_model.reward_layers": LAYERS,
+    "world_model.continue_layers": LAYERS,
+    "world_model.vector_layers": LAYERS,
+    "world_model.head_layers": LAYERS,
     "actor.layers": LAYERS,
     "critic.layers": LAYERS,
     "actor.unimix": BELOW_ONE,

@@ -13,7 +13,10 @@ from vawm.tracking import as_json
 
 
 def write_csv(rows: Sequence[Mapping[str, Any]], path: pathlib.Path) -> None:
-    """A column for every key of the first row; what is not finite is left empty."""
+    """A column for every key of the first row; what is not finite is left empty.
+
+    Of no rows a single empty line is written: their columns are not known.
+    """
     with path.open("w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]) if rows else [], lineterminator="\n")
         writer.writeheader()

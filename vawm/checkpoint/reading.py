@@ -64,7 +64,7 @@ def find(logdir: str | os.PathLike[str], items: Collection[str] | None = None) -
     if damaged:
         first = damaged[0][1]
         raise Damaged(first.path, f"{first.how}; and no older checkpoint is whole")
-    state = "holds no checkpoint" if os.path.isdir(logdir) else "is not there"
+    state = "holds no checkpoint" if os.path.exists(logdir) else "is not there"
     remedy = f"{state}; name the folder of a run that saved one"
     raise InvalidInput("logdir", str(logdir), remedy)
 
