@@ -23,7 +23,7 @@ def test_a_new_or_empty_folder_is_accepted_and_not_made(tmp_path):
 
 def test_a_folder_that_holds_something_is_refused(tmp_path):
     (tmp_path / "file").touch()
-    with pytest.raises(InvalidInput, match="exists; continue that run with --resume"):
+    with pytest.raises(InvalidInput, match="with --resume, start over with --fresh or"):
         rundir.check_new(tmp_path)
 
 
