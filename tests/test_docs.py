@@ -137,6 +137,15 @@ def test_the_code_of_a_page_runs(name, stage):
     assert len(stage) == SNIPPETS[name].count("runner.run(")
 
 
+def test_the_losses_of_the_readme_run_as_they_stand():
+    [code] = [code for code in blocks(TEXTS["README.md"], "python") if "losses." in code]
+    names = {}
+    exec(code, names)
+    assert names["weight"].tolist() == pytest.approx([1 / 3] * 8)
+    assert names["total"] == pytest.approx(names["loss"].mean() / 3)
+    assert names["total"] > 0
+
+
 def test_the_losses_of_the_guide_leave_the_critic_alone():
     names = {}
     exec(SNIPPETS["losses-0"], names)
