@@ -250,6 +250,30 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_checkpoint(
     }
 
 
+def test_a_parameter_that_the_last_update_broke_is_told_as_well(tmp_path, fake, monkeypatch):
+    """Its loss is that of the parameters before; one of the update after it never comes."""
+    call = FakeStep.__call__
+
+    def breaks(self, state):
+        state, metrics = call(self, state)
+        if state.env_steps == 96:
+            actor = {"bias": jnp.full(1, jnp.nan)}
+            learner = state.learner
+            params = learner.params._replace(actor=actor)
+            state = state._replace(learner=learner._replace(params=params))
+        return state, metrics
+
+    fake()
+    monkeypatch.setattr(FakeStep, "__call__", breaks)
+    told = r"parameter \.actor\['bias'\] is not finite at env_steps=96; kept: .* at 64.*"
+    with pytest.raises(RunError, match=told + "more in .*diagnosis.json"):
+        run(tiny.CONFIG, tmp_path)
+    found = json.loads((tmp_path / "diagnosis.json").read_text())
+    assert found["nonfinite_parameters"] == [".actor['bias']"]
+    assert (found["loss"], found["value"]) == (None, None)
+    assert lines(tmp_path)[-1]["env_steps"] == 96
+
+
 def test_a_loss_that_is_not_finite_is_told_though_a_save_has_failed(
     tmp_path, fake, monkeypatch
 ):
@@ -514,6 +538,7 @@ def test_a_run_whose_newest_checkpoint_is_damaged_goes_on_from_the_one_before(
     [line] = [line for line in console.file.getvalue().splitlines() if "WARNING" in line]
     assert str(damaged) in line
     assert line.endswith("using the one at 160 env steps instead")
+    assert "going on at 160 env steps" in console.file.getvalue().splitlines()
     assert (checkpoint.root(logdir) / "damaged-000000000192").is_dir()
     assert saves(logdir) == saves(uninterrupted)
     assert_same(logdir, uninterrupted, LONG, tiny.env())

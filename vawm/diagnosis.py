@@ -47,7 +47,6 @@ def write(
     """
     loss = first_nonfinite(metrics)
     broken = {name: str(float(x)) for name, x in metrics.items() if not math.isfinite(x)}
-    params = checkpoint.flatten(state.learner.params)
     content = {
         "loss": loss,
         "value": broken.get(str(loss)),
@@ -56,12 +55,27 @@ def write(
         "optimizer": dataclasses.asdict(config.optimizer),
         "nonfinite_metrics": broken,
         "last_finite_line": last_finite_line(logdir),
-        "nonfinite_parameters": [name for name, x in params.items() if not _is_finite(x)],
+        "nonfinite_parameters": nonfinite_parameters(state),
         "nonfinite_replay": nonfinite_replay(state.replay),
     }
     path = logdir / FILE
     path.write_text(json.dumps(content, indent=2) + "\n")
     return path
+
+
+def reason(state: TrainState, metrics: Mapping[str, Any]) -> str:
+    """The loss that is not finite; or the parameter, where the last update broke it and no
+    loss was computed from it."""
+    if loss := first_nonfinite(metrics):
+        return f"{loss} is {float(metrics[loss])}"
+    return f"parameter {nonfinite_parameters(state)[0]} is not finite"
+
+
+def nonfinite_parameters(state: TrainState) -> list[str]:
+    """Paths of the parameters that are not finite, and of the world model's own state."""
+    learner = state.learner
+    leaves = checkpoint.flatten(learner.params) | checkpoint.flatten(learner.model_state)
+    return [name for name, x in leaves.items() if not _is_finite(x)]
 
 
 def last_finite_line(logdir: pathlib.Path) -> Line | None:

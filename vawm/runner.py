@@ -104,8 +104,8 @@ def run(
 
     Raises:
       InvalidInput: before anything is compiled, allocated or written.
-      RunError: a loss is not finite, an environment failed, memory ran out, or the disk is
-        full.
+      RunError: a loss or a parameter is not finite, an environment failed, memory ran out, or
+        the disk is full.
       SaveError: a checkpoint could not be written.
     """
     logdir = pathlib.Path(logdir).expanduser()
@@ -208,6 +208,7 @@ def _continue(
     missing = resume_lib.cut_back(logdir, env_steps=progress.env_steps, logged=progress.logged)
     if missing:
         say(f"WARNING: {missing}")
+    say(f"going on at {progress.env_steps} env steps")
     return state, progress
 
 
@@ -261,10 +262,12 @@ def _loop(
             state, metrics = step(state)
             metrics = jax.device_get(metrics)
             progress = advance(progress, metrics, began=began)
-            if diagnosis.first_nonfinite(metrics):  # says more than a save that fails then
-                _stop(config, logdir, state, metrics, progress, tracker, saver)
-            saver.check()
             done = progress.env_steps >= config.env_steps
+            last = done or stop.signal is not None  # no loss of a next update would tell
+            broken = diagnosis.first_nonfinite(metrics)
+            if broken or (last and diagnosis.nonfinite_parameters(state)):
+                _stop(config, logdir, state, metrics, progress, tracker, saver)
+            saver.check()  # after that: a loss says more than a save that fails for it
             if _crossed(before, progress.env_steps, config.log_every):
                 line = _line(progress)
                 tracker.write(line)
@@ -339,14 +342,13 @@ def _stop(
     tracker: tracking.Tracker,
     saver: checkpoint.Saver,
 ) -> NoReturn:
-    """A loss that is not finite never comes back: better no run than a wrong one."""
+    """What is not finite never comes back: better no run than a wrong one."""
     tracker.write(_line(progress))
     written = diagnosis.write(logdir, config, state, metrics)
     with contextlib.suppress(checkpoint.SaveError, OSError):  # the loss is the reason
         saver.wait()
-    name = diagnosis.first_nonfinite(metrics)
     raise RunError(
-        f"{name} is {float(metrics[str(name)])} at env_steps={progress.env_steps}; "
+        f"{diagnosis.reason(state, metrics)} at env_steps={progress.env_steps}; "
         f"kept: {checkpoint.kept(logdir)}; more in {written}. "
         f"{diagnosis.advice(state.replay)}"
     )
