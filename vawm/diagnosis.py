@@ -63,12 +63,17 @@ def write(
     return path
 
 
-def reason(state: TrainState, metrics: Mapping[str, Any]) -> str:
-    """The loss that is not finite; or the parameter, where the last update broke it and no
-    loss was computed from it."""
+def reason(state: TrainState, metrics: Mapping[str, Any], *, last: bool) -> str | None:
+    """Why a run cannot go on after the chunk that led to `state`; None if it can.
+
+    A loss that is not finite; after the `last` chunk also a parameter: no loss of a next update
+    would tell.
+    """
     if loss := first_nonfinite(metrics):
         return f"{loss} is {float(metrics[loss])}"
-    return f"parameter {nonfinite_parameters(state)[0]} is not finite"
+    if last and (params := nonfinite_parameters(state)):
+        return f"parameter {params[0]} is not finite"
+    return None
 
 
 def nonfinite_parameters(state: TrainState) -> list[str]:

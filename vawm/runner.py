@@ -263,11 +263,10 @@ def _loop(
             metrics = jax.device_get(metrics)
             progress = advance(progress, metrics, began=began)
             done = progress.env_steps >= config.env_steps
-            last = done or stop.signal is not None  # no loss of a next update would tell
-            broken = diagnosis.first_nonfinite(metrics)
-            if broken or (last and diagnosis.nonfinite_parameters(state)):
-                _stop(config, logdir, state, metrics, progress, tracker, saver)
-            saver.check()  # after that: a loss says more than a save that fails for it
+            last = done or stop.signal is not None
+            if reason := diagnosis.reason(state, metrics, last=last):
+                _stop(reason, config, logdir, state, metrics, progress, tracker, saver)
+            saver.check()  # after that, which says more than a save that fails for it
             if _crossed(before, progress.env_steps, config.log_every):
                 line = _line(progress)
                 tracker.write(line)
@@ -334,6 +333,7 @@ def _append(path: pathlib.Path, line: Line) -> None:
 
 
 def _stop(
+    reason: str,
     config: Config,
     logdir: pathlib.Path,
     state: PyTree,
@@ -345,10 +345,10 @@ def _stop(
     """What is not finite never comes back: better no run than a wrong one."""
     tracker.write(_line(progress))
     written = diagnosis.write(logdir, config, state, metrics)
-    with contextlib.suppress(checkpoint.SaveError, OSError):  # the loss is the reason
+    with contextlib.suppress(checkpoint.SaveError, OSError):  # not the reason
         saver.wait()
     raise RunError(
-        f"{diagnosis.reason(state, metrics)} at env_steps={progress.env_steps}; "
+        f"{reason} at env_steps={progress.env_steps}; "
         f"kept: {checkpoint.kept(logdir)}; more in {written}. "
         f"{diagnosis.advice(state.replay)}"
     )
