@@ -119,6 +119,11 @@ def test_every_rule_is_about_a_field():
         ("env_steps", 2**31, "below 2147483648"),
         ("critic.slow_scale", 2**32, "below 2147483648, or write it with a point"),
         ("train_ratio", 2**31 // 8, "use 268435454 at most"),
+        ("critic.replay_gradient", [], "use True or False"),
+        ("critic.replay_gradient", 1, "use True or False"),
+        ("task", None, "use a text"),
+        ("tracker_project", 3, "use a text"),
+        ("actor", None, "use ActorConfig"),
     ],
 )
 def test_bad_values_come_with_a_remedy(name, value, remedy):

@@ -91,6 +91,7 @@ RULES: dict[str, Rule] = {
 }
 """Every other number has to be positive."""
 
+KINDS = {bool: "True or False", str: "a text"}
 INT32 = 2**31  # whole numbers are counted with on the device, all but the seed
 
 
@@ -105,6 +106,8 @@ def check(config: Config) -> None:
             check_choice(name, value, typing.get_args(kind))
         elif kind in (int, float):
             _check_number(name, value, kind)
+        elif isinstance(kind, type) and not isinstance(value, kind):
+            raise InvalidInput(name, value, f"use {KINDS.get(kind, kind.__name__)}")
     _check_together(config)
 
 
@@ -192,9 +195,9 @@ def _check_names(config: Config) -> None:
             raise InvalidInput("size", config.size, remedy)
 
 
-def _check_project(name: Any) -> None:
+def _check_project(name: str) -> None:
     """What is a name of a project, and of a file, everywhere."""
-    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}", name):
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}", name):
         remedy = "use up to 100 letters, digits, '-', '_' and '.', a letter or digit first"
         raise InvalidInput("tracker_project", name, remedy)
 
