@@ -257,13 +257,14 @@ def _loop(
         tracker.show_videos(after=progress.logged)
         display.note("compiling (takes a minute the first time, seconds from then on) ...")
         step = program.compile(state)
-        while progress.env_steps < config.env_steps and stop.signal is None:
+        last = progress.env_steps >= config.env_steps or stop.signal is not None
+        while not last:
             before, began = progress.env_steps, time.perf_counter()
             state, metrics = step(state)
             metrics = jax.device_get(metrics)
             progress = advance(progress, metrics, began=began)
             done = progress.env_steps >= config.env_steps
-            last = done or stop.signal is not None
+            last = done or stop.signal is not None  # read once: what ends a run is saved
             if reason := diagnosis.reason(state, metrics, last=last):
                 _stop(reason, config, logdir, state, metrics, progress, tracker, saver)
             saver.check()  # after that, which says more than a save that fails for it
@@ -276,7 +277,7 @@ def _loop(
                 tracker.write(_line(progress))
             if film and _crossed(before, progress.env_steps, config.video.every):
                 tracker.write_videos(film(state), env_steps=progress.env_steps)
-            due = done or stop.signal or saver.is_time()
+            due = last or saver.is_time()
             due = due or _crossed(before, progress.env_steps, config.save_every)
             if due and progress.env_steps > last_saved:
                 saver.save(
