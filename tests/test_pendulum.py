@@ -1,6 +1,5 @@
 """A whole run on real physics: trained, resumed, evaluated, and used as the README says."""
 
-import math
 import pathlib
 import re
 
@@ -68,20 +67,6 @@ def test_the_readme_loads_a_checkpoint_and_acts(logdir, monkeypatch):
     assert names["action"].shape == (4, 1)
     assert jnp.isfinite(names["action"]).all()
     assert names["timestep"].obs.shape == (4, 3)
-
-
-def test_the_readme_uses_the_losses():
-    prior = 0.6, 0.1, 0.1, 0.1, 0.1
-    names = {
-        "value_logits": jnp.zeros((2, 3, 5)),
-        "prior_value_logits": jnp.log(jnp.array([[prior]])) * jnp.ones((2, 3, 1)),
-        "latent_kl": jnp.full((2, 3), 4.0),
-        "env_steps": 20_000,
-    }
-    exec(snippet("vawm.losses"), names)
-    forward = sum(0.2 * math.log(0.2 / p) for p in prior)
-    assert jnp.allclose(names["loss"], 0.6 * forward, atol=1e-6)
-    assert (names["weight"] == 0.25).all()
 
 
 def test_the_readme_makes_environments():
