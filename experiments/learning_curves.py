@@ -147,7 +147,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     check(options, sweep)
 
     def report() -> None:
-        rows = results.read(sweep)
+        rows = results.read_some(sweep)
         write(rows, options, sweep)
         print(summary(rows, sweep))
 

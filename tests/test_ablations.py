@@ -62,6 +62,16 @@ def make(name, scale, agent="dreamerv3", **changes):
     return options, ablation.make_sweep(ABLATIONS[name], options, PROGRAMS)
 
 
+def test_where_nothing_was_measured_what_is_written_stays(tmp_path, capsys):
+    written = tmp_path / "ablation_noise.md"
+    written.write_text("a table")
+    flags = ["--collect-only", "--runs", str(tmp_path / "none"), "--results", str(tmp_path)]
+    assert command_line.guard(lambda: SCRIPTS["noise"].main(flags)) == 1
+    assert "nothing is written" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == [written.name]
+    assert written.read_text() == "a table"
+
+
 @pytest.mark.parametrize("agent", config_lib.AGENT_CONFIGS)
 @pytest.mark.parametrize("scale", ["quick", "paper"])
 @pytest.mark.parametrize("name", ABLATIONS)

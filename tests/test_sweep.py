@@ -15,6 +15,7 @@ import tiny
 from vawm import command_line, rundir
 from vawm.analysis import tables
 from vawm.errors import InvalidInput
+from vawm.runner import RunError
 from vawm.sweep import children, figures, results, runs
 from vawm.sweep.runs import Run, Sweep, Variant
 
@@ -209,6 +210,8 @@ def test_the_table_is_the_one_worked_by_hand(finished):
 def test_a_table_of_nothing_says_so(tmp_path):
     sweep = make_sweep(tmp_path, "finish", seeds=(4,))
     assert results.read(sweep) == []
+    with pytest.raises(RunError, match="has measured anything yet"):
+        results.read_some(sweep)
     table = results.markdown(results.summarise(sweep, []), factor="x", command="c", notes="n")
     assert "| a/b | finish | **0 of 1** | - | - | - | - |" in table
     assert "a/b, finish, seed 4: has no returns" in table

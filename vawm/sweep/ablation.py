@@ -142,7 +142,7 @@ def run(ablation: Ablation, options: Options, *, script: str) -> int:
 
     Raises:
       InvalidInput: before anything is started.
-      RunError: matplotlib is missing.
+      RunError: matplotlib is missing, or no run has measured anything.
     """
     sweep = make_sweep(ablation, options, programs_folder(script))
     check(ablation, options, sweep)
@@ -193,9 +193,13 @@ def result_name(ablation: Ablation, options: Compared) -> str:
 
 
 def write(ablation: Ablation, options: Options, sweep: Sweep, made_by: str) -> str:
-    """Writes table and figures of what is there; returns the table in Markdown."""
+    """Writes table and figures of what is there; returns the table in Markdown.
+
+    Raises:
+      RunError: nothing is.
+    """
     columns = results.RETURN | ablation.extra
-    rows = results.read(sweep, columns)
+    rows = results.read_some(sweep, columns)
     options.results.mkdir(parents=True, exist_ok=True)
     path = options.results / result_name(ablation, options)
     write_csv(rows, path.with_suffix(".csv"))

@@ -76,9 +76,9 @@ def run_then(jobs: Sequence[Job], report: Callable[[], None], *, at_once: int) -
     if outcome.exit_code:
         print("stopped; the same command goes on")
         return outcome.exit_code
-    report()
     for job, code in outcome.failed:
         print(f"error: {job.name} ended with exit code {code}, see {job.log}", file=sys.stderr)
+    report()
     return 1 if outcome.failed else 0
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from vawm import tracking
 from vawm.analysis.values import mean_and_error
+from vawm.runner import RunError
 from vawm.sweep import runs
 from vawm.sweep.runs import Run, Sweep
 
@@ -66,6 +67,17 @@ def read(sweep: Sweep, columns: Mapping[str, str] = RETURN) -> Rows:
                 minutes = round(metrics["time"] / 60, 2)
                 rows.append(vars(run) | counted | {"minutes": minutes} | measured)
     return rows
+
+
+def read_some(sweep: Sweep, columns: Mapping[str, str] = RETURN) -> Rows:
+    """`read`, for results that are to be written in the place of others.
+
+    Raises:
+      RunError: nothing was measured yet.
+    """
+    if rows := read(sweep, columns):
+        return rows
+    raise RunError(f"no run in {sweep.folder} has measured anything yet; nothing is written")
 
 
 def rounded(column: str, value: float | None) -> float | None:
