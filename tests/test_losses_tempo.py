@@ -154,6 +154,34 @@ def test_gradient_is_its_closed_form():
         np.testing.assert_allclose(gradient[name], expected[name], rtol=1e-4, atol=1e-6)
 
 
+def test_a_layer_without_a_second_derivative_will_do():
+    @jax.custom_vjp
+    def sin(x):
+        return jnp.sin(x)
+
+    def no_more(x):
+        raise AssertionError("a second derivative")
+
+    @jax.custom_jvp
+    def slope(x):
+        return jnp.cos(x)
+
+    slope.defjvp(lambda primals, tangents: no_more(primals))
+    sin.defvjp(lambda x: (jnp.sin(x), x), lambda x, g: (g * slope(x),))
+
+    def gradient(layer):
+        return losses.tempo_meta_gradient(
+            lambda theta: jnp.square(layer(theta) - jnp.array([1.0, -1.0])),
+            lambda phi: phi,
+            lambda theta: jnp.square(theta[0] - 2),
+            jnp.full(1, 0.3),
+            jnp.array([0.75, 0.25]),
+            step_size=0.5,
+        )[1]
+
+    np.testing.assert_allclose(gradient(sin), gradient(jnp.sin), rtol=1e-6)
+
+
 def test_weights_and_task_losses_of_another_shape_are_refused():
     params, phi, batch, task = jax.tree.map(jnp.float32, problem())
     sample_losses, weights, task_loss = functions(batch, task)

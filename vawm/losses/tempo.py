@@ -37,8 +37,8 @@ def tempo_meta_gradient(
     values under prior and posterior, as in `value_alignment_loss`.
 
     Nothing is updated here: the caller steps phi along the gradient, then theta with weights
-    w_i(phi), by its own optimisers. The inner gradient is differentiated, so L_i needs a
-    second derivative: a `custom_vjp` without one will not do.
+    w_i(phi), by its own optimisers. theta is held fixed and the inner gradient is linear in
+    the weights, so L_i needs no second derivative: a `custom_vjp` without one will do.
 
     Args:
       sample_losses: maps theta to `[...]` L_i, one per sample, of one batch.
