@@ -1,5 +1,6 @@
 """STORM's layers: one step from a cache against the whole sequence, dropout, initial values."""
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -141,3 +142,22 @@ def test_initial_values_are_uniform_within_one_over_the_root_of_the_inputs():
     values = uniform_in(16)(jax.random.key(0), (16, 1000))
     assert np.abs(values).max() == pytest.approx(0.25, rel=0.01)
     assert float(values.std()) == pytest.approx(0.25 / np.sqrt(3), rel=0.02)
+
+
+def test_dropout_is_on_attention_on_its_output_and_on_the_feed_forward():
+    variables, x, seen = make(), sequence(), []
+
+    def spy(run, args, kwargs, context):
+        y = run(*args, **kwargs)
+        if isinstance(context.module, nn.Dropout) and context.method_name == "__call__":
+            seen.append((args[0].shape, np.asarray((y == 0) & (args[0] != 0))))
+        return y
+
+    with nn.intercept_methods(spy):
+        key = {"dropout": jax.random.key(0)}
+        NET.apply(variables, x, nets.causal(LENGTH), deterministic=False, rngs=key)
+    weights, outputs = (BATCH, HEADS, LENGTH, LENGTH), (BATCH, LENGTH, WIDTH)
+    assert [shape for shape, _ in seen] == 2 * [weights, outputs, outputs]
+    assert all(0.2 < hit.mean() < 0.6 for _, hit in seen)
+    assert (seen[1][1] != seen[2][1]).any()
+    assert (seen[1][1] != seen[4][1]).any()

@@ -285,6 +285,50 @@ def test_explaining_is_traced_once_and_equal_without_jit(name):
 
 
 @pytest.mark.parametrize("name", MODELS)
+def test_imagining_is_traced_once_and_equal_without_jit(name):
+    (params, state), batch = variables(name), experience(name)
+    model, action = agent_of(name).world_model, batch.trajectory.action[:, 0]
+
+    def two_steps(state, key):
+        first, *keys = jax.random.split(key, 3)
+        inferred, (carry, latent) = model.follow(
+            params.world_model, state, first, batch, horizon=2
+        )
+        for key in keys:
+            carry, latent = model.imagine(params.world_model, state, key, carry, action)
+        return inferred, latent
+
+    once = jax.jit(chex.assert_max_traces(two_steps, n=1))
+    for seed in (1, 2):
+        compiled = once(state, jax.random.key(seed))
+    eager = two_steps(state, jax.random.key(seed))
+    for a, b in zip(*map(jax.tree.leaves, (compiled, eager)), strict=True):
+        np.testing.assert_allclose(a, b, atol=2e-5)
+
+
+@pytest.mark.parametrize("name", ["storm", "storm_clear", "storm_pixels"])
+def test_what_storm_imagines_is_drawn_from_the_prior_at_its_own_h(name):
+    """That of the RSSM is in `test_world_model_rssm`. A sure prior leaves little to chance."""
+    (params, state), batch = variables(name), experience(name)
+    model = jax.tree.map(lambda x: x, params.world_model)
+    out = model["storm"]["prior_out"]
+    out = out | {"kernel": 100 * out["kernel"]}
+    model["storm"]["prior_out"] = out
+    params = params._replace(world_model=model)
+    _, (carry, latent) = follow(name)(params, state, 2, batch)
+    drawn = []
+    for t in range(4):
+        logits = latent.deter @ out["kernel"] + out["bias"].reshape(1, -1)
+        probs = np.asarray(jax.nn.softmax(logits.reshape(latent.stoch.shape)))
+        sure = probs.max(-1) > 0.999
+        assert sure.mean() > 0.5
+        np.testing.assert_array_equal(latent.stoch.argmax(-1)[sure], probs.argmax(-1)[sure])
+        drawn.append(np.asarray(latent.stoch))
+        carry, latent = imagine(name)(params, state, t, carry, batch.trajectory.action[:, t])
+    assert (drawn[0] != drawn[-1]).any()
+
+
+@pytest.mark.parametrize("name", MODELS)
 def test_targets_are_what_arrived_where_the_predictions_are(name):
     (params, state), batch = variables(name), experience(name)
     explanation, _ = explain(name)(params, state, 2, batch)
@@ -338,6 +382,16 @@ def test_dropout_is_on_in_training_and_off_in_acting_and_imagination():
     close(*followed, atol=0)
     carry, action = followed[0][1][0], batch.trajectory.action[:, 0]
     close(*[imagine("storm")(params, state, seed, carry, action)[1] for seed in (1, 2)], atol=0)
+    window, acted = agent_of("storm").world_model.initial(BATCH), []
+    obs = jax.tree.map(lambda x: x[:, 0], batch.trajectory.obs)
+    for seed in (1, 2, 3):
+        arguments = window, obs, action, batch.trajectory.is_first[:, 0]
+        window, latent = jitted("storm", "filter")(params, state, seed, *arguments)
+        acted.append(latent.deter)
+        if seed > 1:
+            other = jitted("storm", "filter")(params, state, seed + 10, *arguments)[1]
+            close(other.deter, latent.deter, atol=0)
+    assert (acted[1] != acted[2]).any()  # something is read by then
 
 
 def test_batch_norm_learns_its_statistics_in_training_and_uses_them_elsewhere():
