@@ -7,8 +7,11 @@ import pathlib
 import sys
 
 import pytest
+import tiny_storm
 
 from vawm import command_line, rundir
+from vawm.agent import make_agent
+from vawm.types import EnvSpec, image
 
 FOLDER = pathlib.Path(__file__).parents[1] / "experiments"
 
@@ -22,6 +25,7 @@ def load(name):
 
 
 benchmark, curves = load("benchmark"), load("learning_curves")
+gradient_routes = load("gradient_routes")
 
 
 @pytest.mark.parametrize(
@@ -186,3 +190,23 @@ def test_a_missing_matplotlib_is_told_before_anything_is_trained(options, monkey
     monkeypatch.setattr(curves.children, "run", None)
     assert command_line.guard(lambda: curves.main(words(options))) == 1
     assert "pip install matplotlib" in capsys.readouterr().err
+
+
+def test_gradient_routes_are_those_of_the_equations():
+    """The prior's head is behind z~ alone, and with h stopped the posterior's behind z."""
+    config = tiny_storm.config(world_model=tiny_storm.model(depth=1))
+    agent = make_agent(config, EnvSpec("test", image(48), 3, True, 1, 1, None))
+    options = gradient_routes.Options(seeds=2, batch_length=4, states=64)
+    rows = gradient_routes.routes(agent, config, options)
+    assert list(rows) == [
+        f"{term}, {deter}"
+        for term in ("KL(sg V(s), V(s~))", "KL(V(s), sg V(s~))")
+        for deter in ("h live", "h stopped")
+    ]
+    nothing = [[part == [0.0, 0.0] for part in parts] for parts in rows.values()]
+    assert nothing == [[False] * 5, [False] * 5, [True] + 4 * [False], [True] * 2 + [False] * 3]
+    kls = gradient_routes.noise(agent, config, options)
+    assert kls["shared"][0] == [0.0, 0.0]
+    assert min(kls["independent"][0] + kls["shared"][1]) > 0
+    text = gradient_routes.table(["factor", "1"], {"a": [[0.125, 0.5]], "b": [[0.0, 0.0]]})
+    assert text.splitlines()[2:] == ["| a | 0.12 to 0.5 |", "| b | 0 |"]
