@@ -3,6 +3,7 @@
 import os
 
 import chex
+import hurry
 import hypothesis
 import jax
 import pytest
@@ -11,6 +12,7 @@ from vawm import cache
 from vawm.envs.host import rendering
 
 os.environ.setdefault("MUJOCO_GL", "disable")  # dm_control is asked for physics only
+hurry.hurry()
 cache.enable()
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_debug_key_reuse", True)

@@ -3,6 +3,7 @@
 import pathlib
 import re
 
+import hurry
 import nbclient
 import nbformat
 import pytest
@@ -46,7 +47,8 @@ def test_a_notebook_names_no_folder_of_a_machine(path):
 
 
 @every_notebook
-def test_a_notebook_runs(path):
+def test_a_notebook_runs(path, monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", hurry.USUAL)  # compiled as for a reader: it trains
     notebook = nbformat.read(path, as_version=4)
     client = nbclient.NotebookClient(
         notebook, timeout=CELL_SECONDS, resources={"metadata": {"path": str(path.parent)}}
