@@ -120,8 +120,11 @@ All drills, and the tests or the programs of this file that are they:
 from __future__ import annotations
 
 import argparse
+import collections
+import concurrent.futures
 import contextlib
 import json
+import multiprocessing
 import os
 import pathlib
 import random
@@ -133,11 +136,12 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import fuzz as fuzzing
 import huge_numbers
+import hurry
 import hypothesis
 import jax
 import rich.console
@@ -427,8 +431,9 @@ def huge(folder: pathlib.Path) -> Outcome:
 
 
 def fuzz(folder: pathlib.Path, count: int = 2000) -> Outcome:
-    """Random configs are refused by name, or their step is traced, every 100th is run."""
-    accepted = refused = run = 0
+    """Random configs are refused by name, or they train: each is compiled and makes updates."""
+    accepted: dict[Config, int] = {}
+    refused = 0
 
     @hypothesis.seed(RANDOM.randrange(2**32))
     @hypothesis.settings(
@@ -439,22 +444,44 @@ def fuzz(folder: pathlib.Path, count: int = 2000) -> Outcome:
         suppress_health_check=list(hypothesis.HealthCheck),
     )
     @hypothesis.given(fuzzing.configs())
-    def one(config: Config) -> None:
-        nonlocal accepted, refused, run
+    def collect(config: Config) -> None:
+        nonlocal refused
         if fuzzing.refusal(config, folder / "nowhere"):
             refused += 1
-            return
-        accepted += 1
-        fuzzing.trace(config)
-        if accepted % 100 == 1:
-            fuzzing.run(config)
-            run += 1
-        if accepted % 20 == 0:
-            jax.clear_caches()  # what is traced is kept: 2,000 configs would fill the memory
+        else:
+            accepted[config] = accepted.get(config, 0) + 1
 
-    one()
+    collect()
     assert not (folder / "nowhere").exists()
-    return Outcome(accepted + refused, f"{refused} refused, {accepted} traced, {run} run")
+    print(f"{refused} refused, {len(accepted)} different ones to run", flush=True)
+    ends = collections.Counter(run_all(list(accepted)))
+    seen = ", ".join(f"{number} {end}" for end, number in ends.items())
+    tries = sum(accepted.values())
+    what = f"{refused} refused, {tries} accepted; of {len(accepted)} different ones {seen}"
+    return Outcome(refused + tries, what)
+
+
+def run_alone(config: Config) -> str:
+    """`fuzzing.run`, and what was compiled for it leaves the memory."""
+    try:
+        return fuzzing.run(config)
+    finally:
+        jax.clear_caches()
+
+
+def run_all(configs: list[Config]) -> Iterator[str]:
+    """What comes of each of them, in processes of their own, compiled in a hurry."""
+    hurry.hurry()
+    spawn = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(mp_context=spawn) as pool:
+        runs = {pool.submit(run_alone, config): config for config in configs}
+        for number, done in enumerate(concurrent.futures.as_completed(runs), 1):
+            if error := done.exception():
+                pool.shutdown(cancel_futures=True)
+                raise AssertionError(f"{error!r} of {runs[done]}") from error
+            if number % 20 == 0:
+                print(f"{number} of {len(configs)} run", flush=True)
+            yield done.result()
 
 
 DRILLS = {

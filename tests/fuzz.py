@@ -6,9 +6,11 @@ Each has to be refused by the name of a choice, or to train.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import pathlib
 import typing
+from collections.abc import Callable
 
 import jax
 import tiny
@@ -16,10 +18,12 @@ import tiny_storm
 import tiny_vagram
 from hypothesis import strategies as st
 
-from vawm import runner, train, validate
+from vawm import diagnosis, runner, train, validate
 from vawm.agent import make_agent
 from vawm.config import Config
 from vawm.errors import InvalidInput
+
+STEPS = 50  # of a config that does not come to its second update before
 
 BASES = {"dreamerv3": tiny.CONFIG, "storm": tiny_storm.CONFIG, "vagram": tiny_vagram.CONFIG}
 
@@ -82,23 +86,43 @@ def refusal(config: Config, folder: pathlib.Path) -> str:
 
 def trace(config: Config) -> None:
     """The whole training step of a config that is not refused: states lead to their like."""
-    env = tiny.env()
-    agent = make_agent(config, env.spec)
-    before = jax.eval_shape(lambda key: train.init(env, agent, config, key), jax.random.key(0))
-    after, metrics = jax.eval_shape(train.make_train_step(env, agent, config), before)
-    assert jax.tree.structure(after) == jax.tree.structure(before)
-    for new, old in zip(jax.tree.leaves(after), jax.tree.leaves(before), strict=True):
-        assert (new.shape, new.dtype) == (old.shape, old.dtype)
+    init, step = programs(config)
+    before = jax.eval_shape(init, jax.random.key(0))
+    after, metrics = jax.eval_shape(step, before)
+    check_alike(before, after)
     assert all(metric.shape == () for metric in metrics.values())
 
 
-def run(config: Config) -> None:
-    """As `trace`, but compiled and done: two updates, all that is learned stays finite."""
+def run(config: Config) -> str:
+    """As `trace`, but compiled and done, until two updates, and what came of it.
+
+    "learned": all that is learned stays finite. "diagnosed": it does not, and a run would say
+    so. "collected": there was no second update in as many steps.
+    """
+    init, step = programs(config)
+    step = jax.jit(step)
+    state = jax.jit(init)(jax.random.key(0))
+    for _ in range(STEPS):
+        before = jax.eval_shape(lambda x: x, state)
+        state, metrics = step(state)
+        check_alike(before, state)
+        if diagnosis.reason(state, jax.device_get(metrics), last=True):
+            return "diagnosed"
+        if int(state.learner.step) >= 2:
+            return "learned"
+    return "collected"
+
+
+def programs(config: Config) -> tuple[Callable, Callable]:
+    """The functions that begin and continue a run of `config`."""
     env = tiny.env()
     agent = make_agent(config, env.spec)
-    state = jax.jit(lambda key: train.init(env, agent, config, key))(jax.random.key(0))
-    step = jax.jit(train.make_train_step(env, agent, config))
-    while int(state.learner.step) < 2:
-        state, _ = step(state)
-    for leaf in jax.tree.leaves(state.learner.params):
-        assert bool(jax.numpy.isfinite(leaf).all())
+    return functools.partial(train.init, env, agent, config), train.make_train_step(
+        env, agent, config
+    )
+
+
+def check_alike(before: typing.Any, after: typing.Any) -> None:
+    assert jax.tree.structure(after) == jax.tree.structure(before)
+    for new, old in zip(jax.tree.leaves(after), jax.tree.leaves(before), strict=True):
+        assert (new.shape, new.dtype) == (old.shape, old.dtype)
