@@ -25,7 +25,7 @@ def trained():
     with tiny_pixels.pool() as env:
         made = program.make(tiny_pixels.CONFIG, env)
         state = made.init(0)
-        step = made.compile(state)
+        step = made.compile(state).run
         history = []
         for _ in range(20):
             state, metrics = step(state)
@@ -87,7 +87,7 @@ def chunks(config, count, env=None):
     with env or tiny_pixels.pool() as env:
         made = program.make(config, env)
         state = made.init(0)
-        step = made.compile(state)
+        step = made.compile(state).run
         history = []
         for _ in range(count):
             state, metrics = step(state)

@@ -4,6 +4,7 @@ import io
 import json
 import sys
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -106,11 +107,27 @@ def test_a_sample_owes_no_part_of_an_update(config, steps):
     assert all(owed[:-1])
 
 
+EXECUTABLES = tuple(
+    jax.jit(lambda x: x @ x + x.sum(), donate_argnums=donate)
+    .lower(jax.ShapeDtypeStruct((size, size), jnp.float32))
+    .compile()
+    for size, donate in ((8, ()), (64, 0))
+)
+
+
+def test_planned_memory_is_of_the_largest_program_and_counts_donated_arguments_once():
+    fresh, donated = EXECUTABLES
+    temporaries = [each.memory_analysis().temp_size_in_bytes for each in EXECUTABLES]
+    assert overhead.planned_bytes([fresh]) == 2 * 4 * 8**2 + temporaries[0]
+    assert overhead.planned_bytes([donated]) == 4 * 64**2 + temporaries[1]
+    assert overhead.planned_bytes(EXECUTABLES) == overhead.planned_bytes([donated])
+
+
 class FakeProgram:
     """Learns in every fourth step."""
 
     init = staticmethod(lambda seed: 0)
-    compile = staticmethod(lambda state: FakeProgram.step)
+    compile = staticmethod(lambda state: program.CompiledStep(FakeProgram.step, EXECUTABLES))
     close = staticmethod(lambda: None)
 
     @staticmethod
@@ -134,7 +151,7 @@ def test_the_process_answers_every_line(monkeypatch):
     assert ready["run_env_steps"] == 40_000
     assert len(timed) == 2
     assert all(answer["seconds"] > 0 for answer in timed)
-    assert peak["peak_bytes"] > 2**20
+    assert peak["peak_bytes"] == overhead.planned_bytes(EXECUTABLES)
     assert rules[0]("loss/actor")
     assert not rules[0]("loss/value_alignment")
 
@@ -146,7 +163,7 @@ def test_metrics_that_are_not_kept_are_not_computed(monkeypatch):
     monkeypatch.setattr(program.train, "make_train_step", lambda *_: two)
     monkeypatch.setattr(program.train, "init", lambda *_: jnp.zeros(()))
     made = program.on_device(tiny.env(), None, tiny.CONFIG, lambda name: name == "kept")
-    _, metrics = made.compile(jnp.zeros(()))(jnp.zeros(()))
+    _, metrics = made.compile(jnp.zeros(())).run(jnp.zeros(()))
     assert list(metrics) == ["kept"]
 
     monkeypatch.setattr(

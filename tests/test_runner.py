@@ -31,7 +31,7 @@ from vawm import (
     tracking,
 )
 from vawm.errors import InvalidInput
-from vawm.program import Program
+from vawm.program import CompiledStep, Program
 from vawm.runner import RunError
 from vawm.types import Trajectory
 
@@ -92,7 +92,7 @@ def fake(monkeypatch):
             agent=None,
             shapes=None,
             init=lambda seed: toy.state()._replace(replay=stored()),
-            compile=lambda state: FakeStep(loss),
+            compile=lambda state: CompiledStep(FakeStep(loss), ()),
             episodes=lambda: None,
             resume=lambda state, _: (state, 0),
             close=lambda: None,
@@ -310,7 +310,7 @@ def test_rewards_that_are_nan_in_replay_stop_the_run_and_are_named(tmp_path, mon
         program = prepare(*arguments)
 
         def compile_step(state):
-            step = program.compile(state)
+            step = program.compile(state).run
 
             def call(state):
                 chunks.append(len(chunks))
@@ -320,7 +320,7 @@ def test_rewards_that_are_nan_in_replay_stop_the_run_and_are_named(tmp_path, mon
                     state = state._replace(replay=state.replay._replace(trajectory=trajectory))
                 return step(state)
 
-            return call
+            return CompiledStep(call, ())
 
         return program._replace(compile=compile_step)
 

@@ -45,9 +45,9 @@ class Compiled(NamedTuple):
         (learner, replay, metrics)`.
     """
 
-    depart: Callable[..., tuple[Collector, Replay, Key, Key]]
-    arrive: Callable[[Collector, TimeStep], tuple[Collector, Metrics]]
-    update: Callable[..., tuple[Learner, Replay, Metrics]]
+    depart: jax.stages.Compiled
+    arrive: jax.stages.Compiled
+    update: jax.stages.Compiled
     metrics: tuple[str, ...]
 
 

@@ -19,7 +19,6 @@ from vawm.errors import InvalidInput
 from vawm.train import TrainState
 from vawm.types import EnvSpec, PyTree
 
-Step = Callable[[TrainState], tuple[TrainState, Mapping[str, Any]]]
 Arrays = dict[str, np.ndarray]
 Kept = Callable[[str], bool]
 """Whether a metric, by its name, is to be measured."""
@@ -27,6 +26,18 @@ Kept = Callable[[str], bool]
 
 def everything(name: str) -> bool:
     return True
+
+
+class CompiledStep(NamedTuple):
+    """A training step, ready to run.
+
+    Attributes:
+      run: `(state) -> (state, metrics)`; uses its state up.
+      executables: what it runs on the device, one after the other.
+    """
+
+    run: Callable[[TrainState], tuple[TrainState, Mapping[str, Any]]]
+    executables: tuple[jax.stages.Compiled, ...]
 
 
 class Program(NamedTuple):
@@ -37,7 +48,7 @@ class Program(NamedTuple):
       agent: what learns.
       shapes: of the `TrainState`.
       init: `(seed) -> state`.
-      compile: `(state) -> step`; a step uses its state up.
+      compile: `(state) -> step` for states like this one.
       episodes: `() -> arrays` with which the running episodes can be played again; None
         where the state holds the environments itself.
       resume: `(state, episodes) -> (state, count)`: the environments as they were, of which
@@ -49,7 +60,7 @@ class Program(NamedTuple):
     agent: Agent
     shapes: PyTree
     init: Callable[[int], TrainState]
-    compile: Callable[[TrainState], Step]
+    compile: Callable[[TrainState], CompiledStep]
     episodes: Callable[[], Arrays | None]
     resume: Callable[[TrainState, Arrays | None], tuple[TrainState, int]]
     close: Callable[[], None]
@@ -93,12 +104,17 @@ def on_device(
 
     init = jax.jit(functools.partial(train.init, env, agent, config))
     step = jax.jit(train_step_kept, donate_argnums=0)
+
+    def compile_step(state: TrainState) -> CompiledStep:
+        compiled = step.lower(state).compile()
+        return CompiledStep(compiled, (compiled,))
+
     return Program(
         spec=env.spec,
         agent=agent,
         shapes=init.eval_shape(jax.random.key(0)),
         init=lambda seed: init(jax.random.key(seed)),
-        compile=lambda state: step.lower(state).compile(),
+        compile=compile_step,
         episodes=lambda: None,
         resume=lambda state, _: (state, 0),
         close=lambda: None,
@@ -123,9 +139,10 @@ def on_host(
         state = begin(jax.random.key(seed), env.reset(seed))
         return state._replace(images=images())
 
-    def compile_step(state: TrainState) -> Step:
+    def compile_step(state: TrainState) -> CompiledStep:
         programs = host_train.compile_programs(spec, agent, config, state, kept=kept)
-        return host_train.make_step(env, config, programs)
+        executables = programs.depart, programs.update, programs.arrive
+        return CompiledStep(host_train.make_step(env, config, programs), executables)
 
     def resume(state: TrainState, episodes: Arrays | None) -> tuple[TrainState, int]:
         if episodes is None:

@@ -256,7 +256,7 @@ def _loop(
     ):
         tracker.show_videos(after=progress.logged)
         display.note("compiling (takes a minute the first time, seconds from then on) ...")
-        step = program.compile(state)
+        step = program.compile(state).run
         last = progress.env_steps >= config.env_steps or stop.signal is not None
         while not last:
             before, began = progress.env_steps, time.perf_counter()

@@ -7,8 +7,8 @@
 Nothing is trained to the end, so there are no seeds and no runs: a process with value alignment
 and one without it, and without its metrics, take their steps in turn, environments and replay
 included. Absolute times depend on the machine; the overhead is the median over pairs. Peak
-memory is that of the accelerator, or of the process on a CPU, which compiles in it: for small
-batches that is most of it. Replay counts there only as far as it is filled.
+memory is that of the accelerator; on a CPU, which does not tell, it is what XLA has planned for
+a step: arguments, replay among them, results and temporaries.
 """
 
 from __future__ import annotations

@@ -93,8 +93,8 @@ HOW_TO_READ = (
     "A sample is the smallest number of whole steps in which no part of an update is owed. "
     "Medians, and in brackets quartiles over the samples; the overhead is that of a sample "
     "over its neighbour of the other variant. Hours of a whole run follow from the median. "
-    "Peak memory is that of the accelerator, or on a CPU of the process, whose peak is "
-    "compiling, not a step, unless batches are large."
+    "Peak memory is that of the accelerator; on a CPU it is what XLA has planned for a step: "
+    "arguments, results and temporaries."
 )
 
 
