@@ -9,6 +9,7 @@ import re
 import shutil
 import signal
 import time
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -33,7 +34,7 @@ from vawm import (
 from vawm.errors import InvalidInput
 from vawm.program import CompiledStep, Program
 from vawm.runner import RunError
-from vawm.types import Trajectory
+from vawm.types import TimeStep, Trajectory
 
 LONG = tiny.config(env_steps=192)
 
@@ -64,10 +65,23 @@ class FakeStep:
             "env_steps": state.env_steps,
             "updates": state.env_steps // 8,
             "chunk/updates": jnp.int32(1),
+            "chunk/nonfinite": jnp.int32(0),
             "episode/count": jnp.int32(0),
             "episode/return": jnp.float32(0),
             "loss/critic": jnp.float32(loss),
         }
+
+
+class Waiting(NamedTuple):
+    """What has arrived, in place of a `Collector`."""
+
+    timestep: TimeStep
+
+
+def arrived(reward=(0.0, 0.0)):
+    """Of two environments, with these rewards."""
+    flag = jnp.zeros(2, bool)
+    return Waiting(TimeStep(jnp.zeros((2, 1)), jnp.array(reward), flag, flag, flag))
 
 
 def stored(reward=()):
@@ -91,7 +105,7 @@ def fake(monkeypatch):
             spec=toy.SPEC,
             agent=None,
             shapes=None,
-            init=lambda seed: toy.state()._replace(replay=stored()),
+            init=lambda seed: toy.state()._replace(replay=stored(), collector=arrived()),
             compile=lambda state: CompiledStep(FakeStep(loss), ()),
             episodes=lambda: None,
             resume=lambda state, _: (state, 0),
@@ -301,9 +315,64 @@ def test_what_replay_holds_that_is_not_finite_is_named_by_environment_and_step()
     assert not diagnosis.nonfinite_replay(stored([[1e30], [-1e30]]))
 
 
+def test_what_has_arrived_and_is_not_stored_yet_comes_after_what_is():
+    state = toy.state()._replace(replay=stored([[1.0], [math.nan]]), collector=arrived())
+    before = {"field": "reward", "environment": 1, "steps_ago": 0, "steps": 1}
+    assert diagnosis.nonfinite_steps(state) == [before]
+    state = state._replace(collector=arrived([math.inf, 0.0]))
+    now = {"field": "reward", "environment": 0, "steps_ago": -1, "steps": 1}
+    assert diagnosis.nonfinite_steps(state) == [before, now]
+
+
+class Counted(NamedTuple):
+    """The state of an environment, and how often it was stepped."""
+
+    inner: Any
+    steps: jax.Array
+    key: jax.Array
+    calls: jax.Array
+
+
+def breaking(field, at):
+    """The environment of `tiny`; its second one returns one NaN, by call `at`."""
+    plain = tiny.env()
+
+    def counted(state, calls):
+        return Counted(state, state.steps, state.key, calls)
+
+    def reset(key):
+        state, timestep = plain.reset(key)
+        return counted(state, jnp.zeros((), jnp.int32)), timestep
+
+    def step(state, action):
+        calls = state.calls + 1
+        state, timestep = plain.step(state.inner, action)
+        value = getattr(timestep, field)
+        value = value.at[1].set(jnp.where(calls == at, jnp.nan, value[1]))
+        return counted(state, calls), timestep._replace(**{field: value})
+
+    return plain._replace(reset=reset, step=step)
+
+
+@pytest.mark.parametrize("field", ["reward", "obs"])
+def test_one_step_that_is_not_finite_stops_the_run_before_it_is_saved(tmp_path, field):
+    """Of an environment of one's own on the device. Mended, the run goes on."""
+    told = (
+        "what an environment returned is not finite at env_steps=40; kept: the checkpoint at 32;"
+        rf" .*json. Environment 1 returned {field} that is not finite, 2 steps before the newest:"
+        " mend what returned it, then go on with --resume"
+    )
+    with pytest.raises(RunError, match=told):  # call 22 of the 24 of six chunks
+        run(tiny.CONFIG, tmp_path, env=breaking(field, at=22))
+    diagnosed = json.loads((tmp_path / "diagnosis.json").read_text())
+    assert diagnosed["nonfinite_replay"][0]["field"] == field  # the action that followed, too
+    assert not diagnosed["nonfinite_parameters"]
+    mended = run(tiny.CONFIG, tmp_path, env=breaking(field, at=-1), resume=True)
+    assert mended.env_steps == tiny.CONFIG.env_steps
+
+
 def test_rewards_that_are_nan_in_replay_stop_the_run_and_are_named(tmp_path, monkeypatch):
-    """As an environment of one's own on the device could leave them there: nobody looks at
-    what it returns before that is learned from."""
+    """However they came there: it is the loss that tells."""
     prepare, chunks = runner.prepare, []
 
     def poisoned(*arguments):
@@ -329,7 +398,7 @@ def test_rewards_that_are_nan_in_replay_stop_the_run_and_are_named(tmp_path, mon
         RunError, match=r"loss/.* is nan at .*; more in .*diagnosis.json"
     ) as error:
         run(tiny.CONFIG, tmp_path)
-    assert "Replay holds reward that is not finite, first of environment 1" in str(error.value)
+    assert "Environment 1 returned reward that is not finite" in str(error.value)
     found = json.loads((tmp_path / "diagnosis.json").read_text())
     ago = 4 * len(chunks) - 1  # 4 calls in a chunk
     assert found["nonfinite_replay"] == [

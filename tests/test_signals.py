@@ -27,7 +27,9 @@ sys.exit(stop.exit_code)
 """
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)]
+)
 @pytest.mark.parametrize("times", ["once", "in a burst", "twice"])
 def test_signals_end_a_process_with_the_code_that_shells_expect(number, code, times):
     process = subprocess.Popen(
@@ -54,6 +56,39 @@ def test_the_handlers_of_before_come_back():
         assert stop.signal == signal.SIGTERM
     assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
     assert stop.exit_code == 143
+
+
+def test_what_is_ignored_stays_ignored():
+    """As SIGHUP is under `nohup`."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with signals.catch() as stop:
+            os.kill(os.getpid(), signal.SIGHUP)
+            os.kill(os.getpid(), signal.SIGTERM)
+            wait_for(lambda: stop.signal is not None)
+            assert stop.signal == signal.SIGTERM
+        assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def test_a_notice_that_nobody_can_read_does_not_end_the_listening():
+    def notice():
+        raise OSError("the terminal is closed")
+
+    with signals.catch(notice) as stop:
+        os.kill(os.getpid(), signal.SIGHUP)
+        wait_for(lambda: stop.signal is not None)
+        time.sleep(0.1)
+        listening = [t for t in threading.enumerate() if "listen" in t.name]
+        assert [thread.is_alive() for thread in listening] == [True]
+
+
+def wait_for(condition):
+    end = time.monotonic() + 10
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
 
 
 def test_outside_the_main_thread_nothing_is_caught():

@@ -22,6 +22,7 @@ class State(NamedTuple):
     replay: Any
     key: jax.Array
     env_steps: jax.Array
+    collector: Any = ()
 
 
 def state(seed=0, width=3):

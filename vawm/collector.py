@@ -6,6 +6,7 @@ a jittable environment between them; where environments run on the host, the hos
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -73,7 +74,8 @@ def arrive(
 ) -> tuple[Collector, Metrics]:
     """Takes in what an environment answered; `collector` has its new state already.
 
-    Metrics are sums over the episodes that ended in this step.
+    Metrics are sums over the episodes that ended in this step, and `chunk/nonfinite`, of how
+    many environments something that arrived is not finite.
     """
     moved = ~timestep.is_first
     episode_return = jnp.where(moved, collector.episode_return, 0.0) + timestep.reward
@@ -83,6 +85,7 @@ def arrive(
         "episode/count": jnp.sum(ended),
         "episode/return": jnp.sum(jnp.where(ended, episode_return, 0.0)),
         "episode/length": jnp.sum(jnp.where(ended, episode_length, 0)),
+        "chunk/nonfinite": jnp.sum(~is_finite((timestep.obs, timestep.reward))),
     }
     return Collector(
         env_state=collector.env_state,
@@ -92,6 +95,16 @@ def arrive(
         episode_return=episode_return,
         episode_length=episode_length,
     ), metrics
+
+
+def is_finite(arrived: PyTree) -> Array:
+    """Whether all of an environment's arrays `[N, ...]` are finite, `[N]`."""
+
+    def per_env(x: Array) -> Array:
+        return jnp.isfinite(x).all(range(1, x.ndim))
+
+    floating = (x for x in jax.tree.leaves(arrived) if jnp.issubdtype(x.dtype, jnp.floating))
+    return functools.reduce(jnp.logical_and, map(per_env, floating))
 
 
 def make_collect(env: Environment, agent: Agent, config: Config) -> Collect:

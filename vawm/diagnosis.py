@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vawm import checkpoint, tracking
+from vawm.collector import is_finite
 from vawm.config import Config
 from vawm.replay import Replay
 from vawm.tracking import METRICS, Line
@@ -39,8 +40,8 @@ def write(
 
     It names the loss and its value, env steps and updates, the optimiser's choices, every
     metric of the chunk that is not finite, the last line of metrics whose losses are all
-    finite, the parameters that are not finite, and what replay holds that is not: that
-    came from the environments, or from the policy.
+    finite, the parameters that are not finite, and what replay holds that is not, or waits
+    to be stored: that came from the environments, or from the policy.
 
     Raises:
       OSError: it cannot be written.
@@ -56,7 +57,7 @@ def write(
         "nonfinite_metrics": broken,
         "last_finite_line": last_finite_line(logdir),
         "nonfinite_parameters": nonfinite_parameters(state),
-        "nonfinite_replay": nonfinite_replay(state.replay),
+        "nonfinite_replay": nonfinite_steps(state),
     }
     path = logdir / FILE
     path.write_text(json.dumps(content, indent=2) + "\n")
@@ -66,9 +67,12 @@ def write(
 def reason(state: TrainState, metrics: Mapping[str, Any], *, last: bool) -> str | None:
     """Why a run cannot go on after the chunk that led to `state`; None if it can.
 
-    A loss that is not finite; after the `last` chunk also a parameter: no loss of a next update
-    would tell.
+    Something that arrived from an environment and is not finite: it would be saved with replay,
+    and be learned from one day. A loss; after the `last` chunk also a parameter: no loss of a
+    next update would tell.
     """
+    if int(metrics["chunk/nonfinite"]):
+        return "what an environment returned is not finite"
     if loss := first_nonfinite(metrics):
         return f"{loss} is {float(metrics[loss])}"
     if last and (params := nonfinite_parameters(state)):
@@ -90,6 +94,19 @@ def last_finite_line(logdir: pathlib.Path) -> Line | None:
         if losses and None not in losses:  # null is what is not finite
             return line
     return None
+
+
+def nonfinite_steps(state: TrainState) -> list[dict[str, Any]]:
+    """`nonfinite_replay`, and what arrived after the newest of its steps: -1 steps ago."""
+    found = nonfinite_replay(state.replay)
+    for name, leaf in checkpoint.flatten(state.collector.timestep).items():
+        if not jnp.issubdtype(leaf.dtype, jnp.floating):
+            continue
+        envs = np.flatnonzero(~np.asarray(is_finite(leaf)))
+        if len(envs):
+            field = {"field": name.lstrip("."), "environment": int(envs[0])}
+            found.append(field | {"steps_ago": -1, "steps": len(envs)})
+    return found
 
 
 def nonfinite_replay(replay: Replay) -> list[dict[str, Any]]:
@@ -120,16 +137,16 @@ def nonfinite_replay(replay: Replay) -> list[dict[str, Any]]:
     return found
 
 
-def advice(replay: Replay) -> str:
-    """What to do about a run that has learned from `replay`, in one sentence."""
-    found = nonfinite_replay(replay)
+def advice(state: TrainState) -> str:
+    """What to do about a run that has come to `state`, in one sentence."""
+    found = nonfinite_steps(state)
     if not found:
         return "Start again with a smaller --optimizer.learning-rate or another --seed"
     first = found[0]
     return (
-        f"Replay holds {first['field']} that is not finite, first of environment "
-        f"{first['environment']}, {first['steps_ago']} steps ago: mend what returned it, then "
-        "start again"
+        f"Environment {first['environment']} returned {first['field']} that is not finite, "
+        f"{first['steps_ago'] + 1} steps before the newest: mend what returned it, then go on "
+        "with --resume"
     )
 
 

@@ -33,7 +33,7 @@ from vawm import (
 from vawm import program as program_lib
 from vawm import resume as resume_lib
 from vawm.config import Config
-from vawm.display import Display
+from vawm.display import Display, standard_output
 from vawm.envs.protocol import Environment, EnvironmentFailure, HostEnvironment
 from vawm.errors import InvalidInput
 from vawm.program import Program
@@ -109,7 +109,7 @@ def run(
       SaveError: a checkpoint could not be written.
     """
     logdir = pathlib.Path(logdir).expanduser()
-    console = console or rich.console.Console()
+    console = console or standard_output()
     say = functools.partial(console.print, highlight=False, soft_wrap=True, markup=False)
     with contextlib.ExitStack() as stack:
         stack.enter_context(_explained(logdir))
@@ -351,7 +351,7 @@ def _stop(
     raise RunError(
         f"{reason} at env_steps={progress.env_steps}; "
         f"kept: {checkpoint.kept(logdir)}; more in {written}. "
-        f"{diagnosis.advice(state.replay)}"
+        f"{diagnosis.advice(state)}"
     )
 
 

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: the first asks a run to stop in order, a later one ends it."""
+"""Ctrl-C, SIGTERM and SIGHUP: the first asks a run to stop in order, a later one ends it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""What asks a run to stop: its user, the scheduler, a terminal or a connection that is closed."""
 BURST_SECONDS = 1.0
 """Signals so close together are one: `timeout` sends two, a terminal one to each process."""
 
@@ -31,12 +32,14 @@ def catch(notify: Callable[[], None] = lambda: None) -> Iterator[Stop]:
 
     A thread hears of signals through a pipe, because Python runs its own handlers only
     between two calls of compiled code, which can be minutes apart. Outside the main
-    thread signals cannot be caught, and nothing is.
+    thread signals cannot be caught, and nothing is. What is ignored stays so, as SIGHUP is
+    under `nohup`.
 
     Args:
       notify: called at the first signal, in that thread.
     """
     stop, asked = Stop(), 0.0
+    caught = [number for number in SIGNALS if signal.getsignal(number) != signal.SIG_IGN]
     if threading.current_thread() is not threading.main_thread():
         yield stop
         return
@@ -46,16 +49,17 @@ def catch(notify: Callable[[], None] = lambda: None) -> Iterator[Stop]:
     def listen() -> None:
         nonlocal asked
         while received := os.read(reader, 1):
-            if received[0] not in SIGNALS:
+            if received[0] not in caught:
                 continue
             if stop.signal is None:
                 stop.signal, asked = received[0], time.monotonic()
-                notify()
+                with contextlib.suppress(OSError):  # a closed terminal takes no line
+                    notify()
             elif time.monotonic() - asked > BURST_SECONDS:
                 os._exit(128 + received[0])
 
     thread = threading.Thread(target=listen, daemon=True)
-    previous = {number: signal.signal(number, lambda *_: None) for number in SIGNALS}
+    previous = {number: signal.signal(number, lambda *_: None) for number in caught}
     previous_fd = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
     thread.start()
     try:

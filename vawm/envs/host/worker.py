@@ -320,7 +320,7 @@ def main() -> None:
     settings = json.loads(sys.argv[-1])
     for name in ("channel", "memory", "crash"):
         os.set_inheritable(settings[name], False)  # not for programs a simulator starts
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         # Not SIG_IGN, which the programs that a simulator starts would inherit.
         signal.signal(number, lambda *_: None)
     # It is in the background of a terminal, which may stop those that print.
