@@ -14,7 +14,8 @@ import types
 import numpy as np
 import pytest
 import tiny
-from runs import events
+import toy
+from runs import events, save_toy
 
 from vawm import backends, runner, tracking, validate
 from vawm.backends import Feed
@@ -121,7 +122,7 @@ def test_a_backend_that_fails_is_one_warning_and_the_run_goes_on(
 
 def test_a_backend_that_hangs_costs_a_bounded_wait_at_the_end(stuck):
     said = []
-    feed = Feed("wandb", lambda: Remote(stuck), said.append, patience=0.2)
+    feed = Feed("wandb", lambda: Remote(stuck), said.append, patience=lambda: 0.2)
     began = time.monotonic()
     for env_steps in range(10):
         feed.write(line(env_steps))
@@ -161,6 +162,31 @@ def test_a_missing_package_is_refused_with_the_command_that_installs_it(
         )
     assert error.value.field == "tracker"
     assert not list(tmp_path.iterdir())
+
+
+def test_a_run_that_was_begun_goes_on_without_a_package_that_is_gone(tmp_path, monkeypatch):
+    save_toy(tmp_path, toy.state(), config=CONFIG)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
+    runner.check(CONFIG, tmp_path, resume=True, known_task=False)
+    monkeypatch.setitem(sys.modules, "wandb", None)  # which cannot be imported
+    (warning,) = part(tmp_path, 8, 16, resumed=True)
+    assert warning.startswith("warning: wandb gets no more of this run (import of wandb halted")
+    assert_complete(tmp_path, [8, 16])
+
+
+def test_a_run_that_was_asked_to_end_waits_less(tmp_path, monkeypatch, stuck):
+    monkeypatch.setattr(backends, "HURRIED_PATIENCE", 0.3)
+    use(monkeypatch, lambda *_: Remote(stuck))
+    said, asked = [], threading.Event()
+    (feed,) = backends.connect(
+        CONFIG, tmp_path, resumed=False, say=said.append, hurried=asked.is_set
+    )
+    feed.write(line(8))
+    threading.Timer(0.2, asked.set).start()  # while it waits already
+    began = time.monotonic()
+    feed.close()
+    assert 0.2 < time.monotonic() - began < 5
+    assert "not done after" in said[0]
 
 
 def test_a_folder_that_has_the_name_of_a_package_is_not_one(tmp_path, monkeypatch):
@@ -267,10 +293,20 @@ def test_a_fault_of_tensorboard_is_one_warning_and_the_run_goes_on(tmp_path, mon
     assert [entry["env_steps"] for entry in kept] == [8, 16]
 
 
-def test_the_file_of_tensorboard_that_cannot_be_written_stops_the_run(tmp_path, monkeypatch):
-    monkeypatch.setattr(tracking, "RecordWriter", lambda _: Broken(OSError(28, "No space")))
+@pytest.mark.parametrize("number", tracking.FULL)
+def test_a_full_disk_under_the_file_of_tensorboard_stops_the_run(tmp_path, monkeypatch, number):
+    monkeypatch.setattr(tracking, "RecordWriter", lambda _: Broken(OSError(number, "No space")))
     with pytest.raises(OSError, match="No space"):
         Tracker(tmp_path)
+
+
+def test_any_other_error_of_its_file_does_not(tmp_path, monkeypatch):
+    monkeypatch.setattr(tracking, "RecordWriter", lambda _: Broken(OSError(5, "I/O error")))
+    said = []
+    with Tracker(tmp_path, say=said.append) as tracker:
+        tracker.write(line(8))
+    assert "I/O error" in said[0]
+    assert [entry["env_steps"] for entry in tracking.read(tmp_path / "metrics.jsonl")] == [8]
 
 
 # The real ones, each in two parts and a process of its own, as a run is resumed.

@@ -104,6 +104,15 @@ def test_episodes_larger_than_any_are_refused(path):
     refused(path, "bytes of episodes, .* are allowed")
 
 
+def test_small_files_do_not_unfold_into_huge_parameters(path):
+    def enlarge(content):
+        leaves = content["leaves"]["params"]
+        leaves[next(iter(leaves))]["shape"] = [10**9]
+
+    rewrite(path, enlarge)
+    refused(path, "4000000.* bytes of params cannot come of")
+
+
 def test_arrays_larger_than_the_manifest_says_are_refused_before_they_are_read(
     path, monkeypatch
 ):
@@ -187,10 +196,10 @@ def test_a_huge_manifest_is_not_read(path, monkeypatch):
     refused(path, "more than the 16777216 allowed")
 
 
-FIELDS = ("schema", "version", "env_steps", "config", "spec", "progress", "leaves", "files")
+FIELDS = ("schema", "version", "computed", "env_steps", "config", "spec", "progress", "leaves")
 
 
-@pytest.mark.parametrize("field", FIELDS)
+@pytest.mark.parametrize("field", [*FIELDS, "files"])
 def test_a_field_that_is_missing_or_of_another_kind_is_refused(path, field):
     text = (path / manifest.NAME).read_bytes()
     rewrite(path, lambda content: content.pop(field))
@@ -206,13 +215,14 @@ def test_a_field_that_is_missing_or_of_another_kind_is_refused(path, field):
     [
         (lambda c: c.update(more=1), "'more' is not known"),
         (
-            lambda c: c.update(schema=2, version="9.9"),
+            lambda c: c.update(schema=3, version="9.9"),
             "its layout is not known; vawm 9.9 wrote it and this is vawm .*: use the one",
         ),
         (
             lambda c: c["config"].update(colour=1) or c.update(version="9.9"),
             r"run/checkpoints/0.*': Config\.colour=1: is not known; vawm 9.9 wrote .* --fresh",
         ),
+        (lambda c: c.update(env_steps=5), "holds the manifest of 5 env steps"),
         (lambda c: c.update(env_steps=-1), "-1 is not a count|'-1' is not a count"),
         (lambda c: c["config"].update(colour=1), r"Config\.colour=1: is not known"),
         (lambda c: c["config"].pop("seed"), r"Config\.seed=None: was not saved"),

@@ -18,9 +18,11 @@ import tiny
 import toy
 
 import vawm
-from vawm import checkpoint, evaluate, export, policy, train, weights
+from vawm import checkpoint, evaluate, export, manifest, policy, suites, train, weights
+from vawm import config as config_lib
 from vawm.agent import make_agent
 from vawm.checkpoint import SaveError
+from vawm.envs.protocol import Environment
 from vawm.errors import InvalidInput
 from vawm.play import Score
 
@@ -105,6 +107,57 @@ def test_a_process_that_never_trained_acts_bit_for_bit_the_same(logdir, exported
     there = np.load(tmp_path / "actions.npy")
     assert np.abs(there).max() > 0
     assert there.tobytes() == np.stack(actions).tobytes()
+
+
+def lines_of(text):
+    """The five lines of a text that has them indented."""
+    return "\n".join(line[4:] for line in text.splitlines() if line.startswith("    "))
+
+
+@pytest.mark.parametrize(
+    ("task", "changes"),
+    [
+        ("cartpole_swingup", {}),
+        ("CartPole-v1", {"suite": "gymnasium", "env": config_lib.GymnasiumConfig(workers=1)}),
+    ],
+)
+def test_the_lines_that_are_promised_act_in_a_process_that_never_trained(
+    tmp_path, task, changes
+):
+    """Those of the docstring and of the model card."""
+    config = tiny.config(task=task, size="custom", **changes)
+    made = suites.make(config)
+    agent = make_agent(config, made.spec)
+    trained = policy.Policy(config, made.spec, 32, *agent.init(jax.random.key(0)), None, None)
+    if not isinstance(made, Environment):
+        made.close()
+    card = export.card(trained, "")
+    usual = {"config": config, "spec": made.spec, "env_steps": 32, "card": card}
+    weights.write(tmp_path / "cartpole", trained.params, trained.state, **usual)
+    shown = card.partition("```python\n")[2].partition("```")[0]
+    blocks = [shown.replace("FOLDER", "cartpole")]
+    if not changes:
+        blocks.append(lines_of(export.__doc__.partition("Five lines")[2]))
+        assert len(blocks[-1].splitlines()) == 5
+    check = "assert action.shape[1] == policy.spec.action_size\n"
+    subprocess.run(
+        [sys.executable, "-c", "".join(f"{block}\n{check}" for block in blocks)],
+        env=os.environ | {"PYTHONPATH": str(pathlib.Path(vawm.__file__).parents[1])},
+        cwd=tmp_path,
+        check=True,
+        timeout=300,
+    )
+
+
+def test_the_card_of_an_environment_of_ones_own_says_so(exported):
+    card = (exported / "README.md").read_text()
+    assert "timestep)  # of your environment" in card
+
+
+def test_a_policy_of_another_version_is_told_in_the_log(exported, monkeypatch, caplog):
+    monkeypatch.setattr(manifest, "version", lambda: "9.9.9")
+    vawm.load(exported)
+    assert "this is vawm 9.9.9: that it acts the same is not promised" in caplog.text
 
 
 @pytest.mark.parametrize("dtype", [jnp.bfloat16, jnp.float16, jnp.int32, bool])
@@ -309,11 +362,19 @@ def test_a_folder_of_a_run_is_not_taken_for_an_export(logdir, tmp_path):
 # The command line
 
 
+CONFIG_AND_KEY = tiny.CONFIG, jax.random.key(1)
+
+
 def test_the_command_line_evaluates_and_exports(logdir, tmp_path, monkeypatch, capsys):
+    logdir = shutil.copytree(logdir, tmp_path / "run")
     asked = []
 
     def fake(policy, **kwargs):
+        """Plays while the run goes on."""
         asked.append((policy.env_steps, kwargs))
+        newer = train.init(tiny.env(), make_agent(tiny.CONFIG, policy.spec), *CONFIG_AND_KEY)
+        usual = {"config": tiny.CONFIG, "spec": policy.spec, "progress": {}}
+        checkpoint.save(logdir, newer, env_steps=40, **usual)
         return Score((1.0, 3.0))
 
     monkeypatch.setitem(evaluate.PROTOCOLS, "dmc_proprio", fake)
@@ -323,6 +384,8 @@ def test_the_command_line_evaluates_and_exports(logdir, tmp_path, monkeypatch, c
     assert asked == [(32, {"episodes": 2, "seed": 5})]
     assert "return 2.0 +- 1.0 over 2 episodes" in capsys.readouterr().out
     assert "2.0 +- 1.0" in (tmp_path / "policy" / weights.CARD).read_text()
+    assert vawm.load(logdir).env_steps == 40
+    assert vawm.load(tmp_path / "policy").env_steps == 32  # which the score is of
 
 
 @pytest.mark.parametrize(

@@ -57,6 +57,14 @@ def check(needed, device, host=None, *, capacity=1000, **smallest):
     memory.check([needed], {"device": device, "host": host}, config, **smallest)
 
 
+def test_a_policy_that_does_not_fit_is_refused_with_the_numbers(monkeypatch):
+    free = {"device": 2**30, "host": 2**28}
+    monkeypatch.setattr(memory, "available", lambda: free)
+    memory.check_policy({"a": jax.ShapeDtypeStruct((2**25,), jnp.float32)}, tiny.CONFIG)
+    with pytest.raises(InvalidInput, match=r"256 MiB to read its parameters, 256 MiB are free"):
+        memory.check_policy({"a": jax.ShapeDtypeStruct((2**25 + 1,), jnp.float32)}, tiny.CONFIG)
+
+
 def test_what_fits_is_accepted():
     check(NEEDED, NEEDED.total)
     check(NEEDED, None)

@@ -9,7 +9,7 @@ import pytest
 import tiny
 import toy
 
-from vawm import checkpoint, replay, resume, rundir, tracking
+from vawm import checkpoint, manifest, replay, resume, rundir, tracking
 from vawm.errors import InvalidInput
 from vawm.types import Latent, Trajectory
 
@@ -52,6 +52,13 @@ def saved(tmp_path):
         tmp_path, toy.state(), env_steps=48, config=tiny.CONFIG, spec=toy.SPEC, progress={}
     )
     return tmp_path
+
+
+def test_what_another_version_began_is_refused_though_it_could_be_read(saved, monkeypatch):
+    monkeypatch.setattr(manifest, "version", lambda: "9.9.9")
+    told = r"began it; vawm .* wrote it and this is vawm 9.9.9: use the one that wrote"
+    with pytest.raises(InvalidInput, match=told):
+        resume.check(saved, tiny.config(env_steps=10_000))
 
 
 def test_a_run_may_be_extended_and_logged_otherwise(saved):

@@ -76,6 +76,34 @@ def test_a_second_claim_is_refused_and_names_the_holder(tmp_path):
         pass
 
 
+@pytest.mark.parametrize("number", [errno.ENOSYS, errno.ENOLCK])
+def test_a_file_system_without_locks_is_a_warning(tmp_path, monkeypatch, number):
+    def flock(*_):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(rundir.fcntl, "flock", flock)
+    said = []
+    with rundir.claim(tmp_path, say=said.append):
+        assert (tmp_path / rundir.LOCK).read_text().startswith(f"process {os.getpid()} on ")
+    [line] = said
+    assert line.startswith(f"WARNING: the file system of {tmp_path} has no locks (")
+
+
+@pytest.mark.parametrize("names", [[], ["lock"], ["config.json", "a"], ["metrics.jsonl"]])
+def test_a_run_may_start_over_where_one_is_or_nothing(tmp_path, names):
+    for name in names:
+        (tmp_path / name).touch()
+    rundir.check_fresh(tmp_path)
+    rundir.check_fresh(tmp_path / "not there")
+
+
+def test_files_that_are_not_of_a_run_are_not_put_aside(tmp_path):
+    for name in ("lock", "thesis.tex"):
+        (tmp_path / name).touch()
+    with pytest.raises(InvalidInput, match="holds files, but no run to start over"):
+        rundir.check_fresh(tmp_path)
+
+
 def test_the_lock_of_a_killed_process_is_free(tmp_path):
     script = (
         "import os, pathlib, sys; from vawm import rundir\n"

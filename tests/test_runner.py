@@ -358,9 +358,9 @@ def breaking(field, at):
 def test_one_step_that_is_not_finite_stops_the_run_before_it_is_saved(tmp_path, field):
     """Of an environment of one's own on the device. Mended, the run goes on."""
     told = (
-        "what an environment returned is not finite at env_steps=40; kept: the checkpoint at 32;"
-        rf" .*json. Environment 1 returned {field} that is not finite, 2 steps before the newest:"
-        " mend what returned it, then go on with --resume"
+        "what an environment returned is not finite at env_steps=40; kept: the checkpoint at "
+        rf"32; .*json. Environment 1 returned {field} that is not finite, 2 steps before the "
+        "newest: mend what returned it, then go on with --resume"
     )
     with pytest.raises(RunError, match=told):  # call 22 of the 24 of six chunks
         run(tiny.CONFIG, tmp_path, env=breaking(field, at=22))
@@ -611,6 +611,15 @@ def test_a_run_whose_newest_checkpoint_is_damaged_goes_on_from_the_one_before(
     assert (checkpoint.root(logdir) / "damaged-000000000192").is_dir()
     assert saves(logdir) == saves(uninterrupted)
     assert_same(logdir, uninterrupted, LONG, tiny.env())
+
+
+def test_another_jax_is_told_because_bits_may_differ(tmp_path, monkeypatch):
+    run(tiny.CONFIG, tmp_path)
+    monkeypatch.setattr(manifest, "computed", lambda: "jax 99 on gpu")
+    console = quiet()
+    run(tiny.config(env_steps=104), tmp_path, resume=True, console=console)
+    now = f"jax {jax.__version__} on cpu"
+    assert f"WARNING: begun with {now}, goes on with jax 99 on gpu: " in console.file.getvalue()
 
 
 def starts(logdir):

@@ -85,6 +85,32 @@ def test_the_next_save_waits_for_the_one_before(tmp_path, gate):
     toy.assert_equal(checkpoint.restore(tmp_path, toy.state())[0], toy.state(16))
 
 
+def test_a_disk_that_does_not_keep_up_is_told_once(tmp_path, gate, monkeypatch):
+    monkeypatch.setattr(saver_lib, "SLOW_SECONDS", 0.1)
+    said = []
+    with checkpoint.Saver(tmp_path, tiny.CONFIG, toy.SPEC, say=said.append) as saving:
+        saving.save(toy.state(8), env_steps=8, progress={})
+        threading.Timer(0.3, gate.set).start()
+        for env_steps in (16, 24, 32):
+            saving.save(toy.state(env_steps), env_steps=env_steps, progress={})
+    [line] = said
+    assert "does not keep up: use a larger --save-every and --save-minutes" in line
+
+
+def test_metrics_are_on_the_disk_before_a_checkpoint_is_complete(tmp_path, monkeypatch):
+    def synced(path):
+        assert checkpoint.latest(tmp_path) is None
+        order.append(path)
+
+    order, metrics = [], tmp_path / "metrics.jsonl"
+    metrics.touch()
+    monkeypatch.setattr(saver_lib, "sync", synced)
+    with checkpoint.Saver(tmp_path, tiny.CONFIG, toy.SPEC, before=metrics) as saving:
+        saving.save(toy.state(8), env_steps=8, progress={})
+    assert order == [metrics]
+    assert checkpoint.latest(tmp_path) is not None
+
+
 def full(*_):
     raise OSError(errno.ENOSPC, "No space left on device")
 

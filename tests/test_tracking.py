@@ -84,6 +84,18 @@ def test_truncation_drops_later_lines_and_half_a_line(tmp_path):
     assert path.read_text() == '{"env_steps": 1}\n{"env_steps": 2}\n'
 
 
+def test_a_truncation_that_meets_a_full_disk_leaves_the_file_as_it_was(tmp_path, monkeypatch):
+    def full(_):
+        raise OSError(28, "No space left on device")
+
+    path, text = tmp_path / "metrics.jsonl", '{"env_steps": 1}\n{"env_steps": 2}\n'
+    path.write_text(text)
+    monkeypatch.setattr(tracking, "sync", full)
+    with pytest.raises(OSError, match="No space"):
+        tracking.truncate(path, 1)
+    assert (path.read_text(), list(tmp_path.iterdir())) == (text, [path])
+
+
 def test_truncation_of_nothing_is_nothing(tmp_path):
     assert tracking.truncate(tmp_path / "metrics.jsonl", 2) == 0
     assert not list(tmp_path.iterdir())

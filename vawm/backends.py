@@ -28,6 +28,7 @@ import json
 import pathlib
 import queue
 import threading
+import time
 import uuid
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -39,8 +40,9 @@ from vawm.tracking import METRICS, Backend, Line, finite, read
 
 CAPACITY = 256
 """Lines and paths of videos that wait for a backend before it counts as too slow."""
-PATIENCE = 30.0
-"""Seconds that the end of a run waits for what is still to be sent."""
+PATIENCE, HURRIED_PATIENCE = 30.0, 5.0
+"""Seconds that the end of a run waits for what is still to be sent; the second after a signal,
+since whoever sent it may kill the process soon."""
 RECORD = "tracker.json"
 
 
@@ -52,7 +54,7 @@ class Feed:
       open_backend: called in the thread.
       say: prints the one line of warning; called by whoever calls the methods.
       capacity: what may wait; more drops the backend.
-      patience: seconds that `close` waits.
+      patience: tells, as often as asked, how many seconds `close` may wait in all.
     """
 
     def __init__(
@@ -62,7 +64,7 @@ class Feed:
         say: Callable[[str], None],
         *,
         capacity: int = CAPACITY,
-        patience: float = PATIENCE,
+        patience: Callable[[], float] = lambda: PATIENCE,
     ):
         self._name, self._say, self._patience = name, say, patience
         self._calls: queue.Queue[Callable[[Backend], None] | None] = queue.Queue(capacity)
@@ -80,9 +82,11 @@ class Feed:
         self._put(None)
         if self._dropped:
             return
-        self._thread.join(self._patience)
+        began = time.monotonic()
+        while self._thread.is_alive() and time.monotonic() - began < self._patience():
+            self._thread.join(0.1)
         if self._thread.is_alive():
-            self._drop(f"not done after {self._patience:.0f} s at the end")
+            self._drop(f"not done after {time.monotonic() - began:.0f} s at the end")
         elif self._failure:
             self._drop(self._failure)
 
@@ -242,7 +246,12 @@ def check(config: Config) -> None:
 
 
 def connect(
-    config: Config, logdir: pathlib.Path, *, resumed: bool, say: Callable[[str], None]
+    config: Config,
+    logdir: pathlib.Path,
+    *,
+    resumed: bool,
+    say: Callable[[str], None],
+    hurried: Callable[[], bool] = lambda: False,
 ) -> Sequence[Backend]:
     """The backend that `config` names, or none; it is opened in a thread of its own.
 
@@ -251,6 +260,7 @@ def connect(
       logdir: its folder.
       resumed: whether `metrics.jsonl` is that of an earlier part of the same run.
       say: prints a warning.
+      hurried: whether the run was asked to end soon.
     """
     if config.tracker == "none":
         return ()
@@ -266,7 +276,10 @@ def connect(
             backend.write(entry)
         return backend
 
-    return [Feed(config.tracker, open_backend, say)]
+    def patience() -> float:
+        return HURRIED_PATIENCE if hurried() else PATIENCE
+
+    return [Feed(config.tracker, open_backend, say, patience=patience)]
 
 
 def _record(config: Config, logdir: pathlib.Path, *, resumed: bool) -> Record:

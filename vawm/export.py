@@ -21,12 +21,13 @@ import pathlib
 import sys
 from collections.abc import Sequence
 
-from vawm import cache, evaluate, flags, huge_pages, tracking, weights
+from vawm import cache, evaluate, flags, huge_pages, suites, tracking, weights
 from vawm import manifest as manifest_lib
 from vawm import policy as policy_lib
 from vawm.agent import parameter_count
 from vawm.command_line import guard
-from vawm.config import Config
+from vawm.config import Config, HostEnvConfig
+from vawm.errors import InvalidInput
 from vawm.play import Score
 from vawm.policy import Policy
 
@@ -39,10 +40,35 @@ PROTOCOLS = {
 """Suite -> what `vawm.evaluate` plays, for the model card."""
 
 
+USAGE = """\
+import jax, vawm
+
+policy = vawm.load("FOLDER")  # this one
+env = vawm.envs.make(policy.spec.task, num_envs=1, action_repeat=policy.spec.action_repeat)
+_, timestep = env.reset(jax.random.key(0))
+carry, action = policy.act(jax.random.key(1), policy.initial(1), timestep)"""
+OWN_USAGE = """\
+import jax, vawm
+
+policy = vawm.load("FOLDER")  # this one
+carry = policy.initial(1)
+carry, action = policy.act(jax.random.key(1), carry, timestep)  # of your environment"""
+HOST_USAGE = """\
+import jax, vawm
+from vawm import suites
+
+policy = vawm.load("FOLDER")  # this one
+with suites.make(policy.config) as env:  # as in training, in processes of its own
+    timestep = env.reset(0)
+    carry = policy.initial(env.spec.num_envs)
+    carry, action = policy.act(jax.random.key(1), carry, timestep)"""
+
+
 def export(
     logdir: str | os.PathLike[str],
     folder: str | os.PathLike[str],
     *,
+    policy: Policy | None = None,
     scores: Score | None = None,
     protocol: str = "",
 ) -> pathlib.Path:
@@ -51,6 +77,8 @@ def export(
     Args:
       logdir: folder of a run.
       folder: not there yet, or empty.
+      policy: which `logdir` was loaded before, such as the one that `scores` are of: a run
+        that goes on has a newer checkpoint by then.
       scores: of an evaluation; without them the model card has the last return of training.
       protocol: how they were obtained; that of the suite, with sampled actions, if not given.
 
@@ -63,7 +91,7 @@ def export(
     """
     logdir, folder = pathlib.Path(logdir).expanduser(), pathlib.Path(folder).expanduser()
     weights.check_output(folder)
-    policy = policy_lib.load(logdir)
+    policy = policy or policy_lib.load(logdir)
     measured = _last_return(logdir, policy.env_steps)
     if scores is not None:
         protocol = protocol or f"{PROTOCOLS[policy.config.suite]}; actions sampled"
@@ -132,11 +160,7 @@ tags: [reinforcement-learning, world-model, jax]
 ## Use
 
 ```python
-import jax, vawm
-
-policy = vawm.load("FOLDER")  # this one
-carry = policy.initial(1)
-carry, action = policy.act(jax.random.key(0), carry, timestep)  # for every vawm.types.TimeStep
+{_usage(config)}
 ```
 
 Evaluate it with `python -m vawm.evaluate --logdir FOLDER`. All choices of the training are in
@@ -146,6 +170,15 @@ Evaluate it with `python -m vawm.evaluate --logdir FOLDER`. All choices of the t
 
 Apache-2.0, as vawm itself.
 """
+
+
+def _usage(config: Config) -> str:
+    """The lines that load the policy and act once."""
+    try:
+        suites.check_task(config)
+    except InvalidInput:
+        return OWN_USAGE
+    return HOST_USAGE if isinstance(config.env, HostEnvConfig) else USAGE
 
 
 def _alignment(config: Config, env_steps: int) -> str:
@@ -182,13 +215,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = flags.read(Arguments, argv, description=__doc__)
     weights.check_output(arguments.output.expanduser())
     evaluate.check(arguments.episodes or 1, arguments.seed)
-    scores = None
+    policy, scores = policy_lib.load(arguments.logdir), None
     if arguments.episodes:
         cache.enable()
-        policy = policy_lib.load(arguments.logdir)
         protocol = evaluate.PROTOCOLS[policy.config.suite]
         scores = protocol(policy, episodes=arguments.episodes, seed=arguments.seed)
-    folder = export(arguments.logdir, arguments.output, scores=scores)
+    folder = export(arguments.logdir, arguments.output, policy=policy, scores=scores)
     print(f"exported to {folder}" + (f", return {scores}" if scores else ""))
     print(f"evaluate with: python -m vawm.evaluate --logdir {folder}")
     return 0

@@ -24,10 +24,10 @@ from vawm.config import Config
 from vawm.errors import InvalidInput
 from vawm.types import ArraySpec, EnvSpec, PyTree
 
-SCHEMA = 1
+SCHEMA = 2
 NAME, DIGEST = "manifest.json", "manifest.sha256"
-EPISODES = "episodes"
-ITEMS = ("params", "model_state", "images", "state", EPISODES)
+PARAMS, EPISODES = "params", "episodes"
+ITEMS = (PARAMS, "model_state", "images", "state", EPISODES)
 """The folders of a checkpoint."""
 DTYPES = (
     *("bool", "bfloat16", "float16", "float32", "float64"),
@@ -38,6 +38,9 @@ MAX_BYTES = 2**24
 MAX_AXES = 32
 FILE_FACTOR, FILE_BYTES, LEAF_BYTES = 2, 2**20, 2**16
 """What the files of an item may take: twice its leaves, and this much whatever their size."""
+SPARSE_FACTOR = 100
+"""How many times as large as their files parameters may be: noise, which they begin as, and
+what training makes of it do not compress."""
 MAX_EPISODES_BYTES = 2**32
 """Of running episodes, whose shapes nothing but the manifest tells."""
 
@@ -95,6 +98,7 @@ class Manifest(NamedTuple):
 
     Attributes:
       version: of the package that wrote it.
+      computed: with which JAX, and on what: "jax 0.10.2 on cpu".
       env_steps: when it was written.
       config: of the run.
       spec: of the environment.
@@ -104,6 +108,7 @@ class Manifest(NamedTuple):
     """
 
     version: str
+    computed: str
     env_steps: int
     config: Config
     spec: EnvSpec
@@ -118,6 +123,11 @@ def version() -> str:
         return importlib.metadata.version("vawm")
     except importlib.metadata.PackageNotFoundError:
         return "unknown"
+
+
+def computed() -> str:
+    """With which JAX this process computes, and on what."""
+    return f"jax {jax.__version__} on {jax.default_backend()}"
 
 
 def spec_as_dict(spec: EnvSpec) -> dict[str, Any]:
@@ -280,7 +290,7 @@ def _first_line(error: Exception) -> str:
 
 def _parse(content: dict[str, Any]) -> Manifest:
     """The manifest in plain JSON; ValueError or TypeError where it is none."""
-    kinds = {"schema": int, "version": str, "env_steps": int}
+    kinds = {"schema": int, "version": str, "computed": str, "env_steps": int}
     kinds |= dict.fromkeys(("config", "spec", "progress", "leaves", "files"), dict)
     _record(content, kinds)
     leaves = {item: _leaves(item, entries) for item, entries in content["leaves"].items()}
@@ -288,6 +298,7 @@ def _parse(content: dict[str, Any]) -> Manifest:
     _check_sizes(leaves, files)
     return Manifest(
         version=content["version"],
+        computed=content["computed"],
         env_steps=_count(content["env_steps"]),
         config=config_from_dict(content["config"]),
         spec=spec_from_dict(content["spec"]),
@@ -360,13 +371,16 @@ def _file(name: str, entry: Any, leaves: Mapping[str, Any]) -> tuple[int, str]:
 def _check_sizes(
     leaves: Mapping[str, Mapping[str, LeafInfo]], files: Mapping[str, tuple[int, str]]
 ) -> None:
-    """No item takes more of the disk than its leaves can need, compressed or not."""
+    """No item takes more of the disk than its leaves can need, compressed or not; and small
+    files do not unfold into huge parameters."""
     for item, infos in leaves.items():
         needed = sum(info.nbytes for info in infos.values())
         limit = FILE_FACTOR * needed + FILE_BYTES + LEAF_BYTES * len(infos)
         total = sum(size for name, (size, _) in files.items() if item_of(name) == item)
         if total > limit:
             raise ValueError(f"{total} bytes of {item}, whose leaves need {limit} at most")
+        if item == PARAMS and needed > SPARSE_FACTOR * total + LEAF_BYTES * len(infos):
+            raise ValueError(f"{needed} bytes of {item} cannot come of {total}")
         if item == EPISODES and needed > MAX_EPISODES_BYTES:
             raise ValueError(f"{needed} bytes of {item}, {MAX_EPISODES_BYTES} are allowed")
 

@@ -296,6 +296,20 @@ def check(
             raise _too_large(need, free, config, smallest)
 
 
+def check_policy(shapes: PyTree, config: Config) -> None:
+    """Refuses parameters that do not fit, of which there are two copies while they are read.
+
+    Raises:
+      InvalidInput: with the numbers.
+    """
+    needed = 2 * nbytes(shapes)
+    for free in available().values():
+        if free is not None and needed > free:
+            numbers = f"{readable(needed)} to read its parameters, {readable(free)} are free"
+            remedy = f"needs {numbers}; use a machine with more memory"
+            raise InvalidInput("size", config.size, remedy)
+
+
 def _too_large(need: Estimate, free: int, config: Config, smallest: int) -> InvalidInput:
     whose = " in host memory" if need.where == "host" else ""
     numbers = (

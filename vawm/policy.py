@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import functools
+import logging
 import os
 from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 import jax
 
-from vawm import checkpoint, validate, weights
+from vawm import checkpoint, memory, validate, weights
+from vawm import manifest as manifest_lib
 from vawm.agent import PolicyCarry, make_agent
 from vawm.config import Config
 from vawm.manifest import Manifest
 from vawm.types import Array, EnvSpec, Key, Params, PyTree, TimeStep
 from vawm.weights import Description
+
+log = logging.getLogger("vawm")
 
 
 class Policy(NamedTuple):
@@ -80,9 +84,21 @@ def import_policy(folder: str | os.PathLike[str]) -> Policy:
 def _policy(
     of: Manifest | Description, read: Callable[[PyTree, PyTree], tuple[PyTree, PyTree]]
 ) -> Policy:
-    """The policy that `of` describes; `read` fills shapes of parameters and state."""
+    """The policy that `of` describes; `read` fills shapes of parameters and state.
+
+    Raises:
+      InvalidInput: it does not fit into memory.
+    """
+    if of.version != manifest_lib.version():
+        log.warning(
+            "vawm %s trained this policy and this is vawm %s: that it acts the same is not "
+            "promised",
+            *(of.version, manifest_lib.version()),
+        )
     agent = make_agent(of.config, of.spec)
-    params, state = read(*jax.eval_shape(agent.init, jax.random.key(0)))
+    shapes = jax.eval_shape(agent.init, jax.random.key(0))
+    memory.check_policy(shapes, of.config)
+    params, state = read(*shapes)
     return Policy(
         config=of.config,
         spec=of.spec,

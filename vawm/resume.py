@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vawm import checkpoint, rundir, tracking, validate
+from vawm import manifest as manifest_lib
 from vawm.config import CUSTOM, Config
 from vawm.errors import InvalidInput
 from vawm.manifest import Manifest
@@ -43,13 +44,15 @@ def check(logdir: str | os.PathLike[str], config: Config) -> None:
     """Whether the run in `logdir` can be continued as `config`.
 
     Raises:
-      InvalidInput: there is none, its checkpoints are gone, a choice differs, or there is
-        nothing left to do.
+      InvalidInput: there is none, its checkpoints are gone, another version wrote them, a
+        choice differs, or there is nothing left to do.
     """
     started = saved_config(logdir)
     path = checkpoint.latest(logdir)
     if path is None:
         _refuse_to_lose(logdir, started)
+    else:
+        _refuse_another_version(checkpoint.find(logdir, ()))
     saved = dict(validate.values(started))
     choices = list(validate.values(config))
     if config.size == CUSTOM:  # the width that differs says more, so its name comes last
@@ -66,6 +69,18 @@ def check(logdir: str | os.PathLike[str], config: Config) -> None:
             return
         remedy = f"the checkpoint is at {done} already; use more to continue it"
         raise InvalidInput("env_steps", config.env_steps, remedy)
+
+
+def _refuse_another_version(found: checkpoint.Found) -> None:
+    """Refuses to go on with what another version began, though it could be read.
+
+    Raises:
+      OtherVersion: a version may compute otherwise, and no metric would tell.
+    """
+    written = found.manifest.version
+    if written != manifest_lib.version():
+        why = "a run goes on with the version that began it"
+        raise manifest_lib.OtherVersion("checkpoint", found.path, why, written=written)
 
 
 def _refuse_to_lose(logdir: str | os.PathLike[str], started: Config) -> None:

@@ -8,7 +8,7 @@ import json
 import os
 import pathlib
 import socket
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 from vawm import config as config_lib
 from vawm import manifest as manifest_lib
@@ -49,11 +49,26 @@ def check_writable(folder: pathlib.Path, name: str = "logdir") -> None:
         raise InvalidInput(name, str(folder), remedy)
 
 
+def check_fresh(logdir: pathlib.Path) -> None:
+    """Refuses to start over where no run is, and something else.
+
+    Raises:
+      InvalidInput: `put_aside` would move files of which this package knows nothing.
+    """
+    check_writable(logdir)
+    of_a_run = (CONFIG, "checkpoints", "metrics.jsonl", f"{REPLACED}*")
+    found = [p for p in logdir.iterdir() if p.name != LOCK] if logdir.is_dir() else []
+    if found and not any(path.match(name) for path in found for name in of_a_run):
+        remedy = "holds files, but no run to start over; choose another --logdir"
+        raise InvalidInput("logdir", str(logdir), remedy)
+
+
 @contextlib.contextmanager
-def claim(logdir: pathlib.Path) -> Iterator[None]:
+def claim(logdir: pathlib.Path, *, say: Callable[[str], None] = print) -> Iterator[None]:
     """Makes the folder and holds it for this process alone.
 
-    The kernel gives the lock back when a process ends, however it ends.
+    The kernel gives the lock back when a process ends, however it ends. Where the file system
+    has no locks, `say` is told so.
 
     Raises:
       InvalidInput: another process holds it, or the folder cannot be made.
@@ -72,6 +87,11 @@ def claim(logdir: pathlib.Path) -> Iterator[None]:
             holder = file.read().strip() or "another process"
             remedy = f"is in use by {holder}; wait for it or choose another --logdir"
             raise InvalidInput("logdir", str(logdir), remedy) from error
+        except OSError as error:
+            say(
+                f"WARNING: the file system of {logdir} has no locks ({error.strerror}): "
+                "nothing keeps a second run out of this folder"
+            )
         file.truncate(0)
         file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
         file.flush()

@@ -11,6 +11,7 @@ import contextlib
 import errno
 import functools
 import pathlib
+import shlex
 import time
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, NoReturn
@@ -30,6 +31,7 @@ from vawm import (
     validate,
     video,
 )
+from vawm import manifest as manifest_lib
 from vawm import program as program_lib
 from vawm import resume as resume_lib
 from vawm.config import Config
@@ -117,7 +119,7 @@ def run(
             stack.enter_context(contextlib.closing(env))
         check(config, logdir, resume=resume, fresh=fresh, known_task=env is None)
         program = stack.enter_context(contextlib.closing(prepare(config, env)))
-        stack.enter_context(rundir.claim(logdir))
+        stack.enter_context(rundir.claim(logdir, say=say))
         if banner:
             say(banner)
         if resume and checkpoint.latest(logdir):
@@ -152,7 +154,8 @@ def check(
     validate.check(config)
     if known_task:
         suites.check_task(config)
-    backends.check(config)
+    if not resume:  # a run that was begun goes on without its tracker
+        backends.check(config)
     if resume and fresh:
         raise InvalidInput("fresh", True, "starts over; leave out --resume, or this")
     if resume:
@@ -160,7 +163,7 @@ def check(
         for folder in (logdir, checkpoint.root(logdir)):
             rundir.check_writable(folder)
     elif fresh:
-        rundir.check_writable(logdir)
+        rundir.check_fresh(logdir)
     else:
         rundir.check_new(logdir)
 
@@ -198,6 +201,9 @@ def _continue(
     restored = resume_lib.restore(logdir, program.shapes)
     if restored.warning:
         say(f"WARNING: {restored.warning}")
+    then, now = restored.manifest.computed, manifest_lib.computed()
+    if then != now:
+        say(f"WARNING: begun with {then}, goes on with {now}: not bit for bit one piece")
     state, lost = program.resume(restored.state, restored.episodes)
     if lost:
         say(
@@ -244,15 +250,29 @@ def _loop(
     log_save = functools.partial(_append, logdir / tracking.SAVE_LINES)
     last_saved = progress.env_steps
     resumed = bool(progress.env_steps)
-    purge_after = progress.logged if resumed else None
-    further = backends.connect(config, logdir, resumed=resumed, say=display.note)
     with (
         signals.catch(lambda: display.note("stopping after this step ...")) as stop,
         tracking.Tracker(
-            logdir, purge_after=purge_after, further=further, say=display.note
+            logdir,
+            purge_after=progress.logged if resumed else None,
+            further=backends.connect(
+                config,
+                logdir,
+                resumed=resumed,
+                say=display.note,
+                hurried=lambda: stop.signal is not None,
+            ),
+            say=display.note,
         ) as tracker,
         display,
-        checkpoint.Saver(logdir, config, program.spec, log=log_save) as saver,
+        checkpoint.Saver(
+            logdir,
+            config,
+            program.spec,
+            before=logdir / tracking.METRICS,
+            log=log_save,
+            say=display.note,
+        ) as saver,
     ):
         tracker.show_videos(after=progress.logged)
         display.note("compiling (takes a minute the first time, seconds from then on) ...")
@@ -402,8 +422,8 @@ def _summarise(
         f"episode return: {shown}",
         f"metrics, TensorBoard events and {saved}: {result.logdir}",
     ]
-    evaluation = f"python -m vawm.evaluate --logdir {result.logdir}"
-    resumption = f"{command} --resume --logdir {result.logdir}"
+    evaluation = f"python -m vawm.evaluate --logdir {shlex.quote(str(result.logdir))}"
+    resumption = f"{command} --resume --logdir {shlex.quote(str(result.logdir))}"
     longer = f" --env-steps {2 * config.env_steps}"
     if not known_task:  # no command line makes its environment
         folder = repr(str(result.logdir))

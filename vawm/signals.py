@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-"""What asks a run to stop: its user, the scheduler, a terminal or a connection that is closed."""
+"""What asks a run to stop: its user, a scheduler, a terminal or a connection that closes."""
 BURST_SECONDS = 1.0
 """Signals so close together are one: `timeout` sends two, a terminal one to each process."""
 

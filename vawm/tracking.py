@@ -4,13 +4,14 @@
 when the interval between two lines is complete. Means weigh every chunk by its number of
 updates; counts are sums. An `Interval` is plain numbers, so a checkpoint can carry it.
 
-TensorBoard's file lies beside it: what keeps the one from being written (a full disk) stops the
-run, because the other and the next checkpoint would fail too. Any other failure of TensorBoard
-is one warning, and the run goes on without it. Further backends are those of `vawm.backends`.
+TensorBoard's file lies beside it: a full disk, which keeps both from being written, stops the
+run, because the next checkpoint would fail too. Any other failure of TensorBoard is one
+warning, and the run goes on without it. Further backends are those of `vawm.backends`.
 """
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
@@ -25,6 +26,7 @@ from tensorboardX.proto.event_pb2 import Event, SessionLog
 from tensorboardX.proto.summary_pb2 import Summary
 from tensorboardX.record_writer import RecordWriter
 
+from vawm.manifest import sync
 from vawm.video import Video, as_gif
 
 Line = dict[str, Any]
@@ -33,6 +35,7 @@ COUNTERS = ("env_steps", "updates")
 METRICS, VIDEOS, VIDEO_LINES = "metrics.jsonl", "videos", "videos.jsonl"
 SAVE_LINES = "checkpoints.jsonl"
 """A line about every checkpoint: its size, how long it took, how long training waited."""
+FULL = (errno.ENOSPC, errno.EDQUOT)
 EPISODE_SUMS = ("episode/return", "episode/length")
 
 
@@ -153,8 +156,13 @@ def truncate(path: str | os.PathLike[str], env_steps: int) -> int:
     last = max((number for number, stays in enumerate(stay) if stays), default=-1)
     kept = [entry for entry, stays in zip(entries, stay, strict=True) if entry and stays]
     scratch = path.with_suffix(".jsonl.tmp")
-    scratch.write_text("".join(as_json(entry) + "\n" for entry in kept))
-    scratch.replace(path)
+    try:
+        scratch.write_text("".join(as_json(entry) + "\n" for entry in kept))
+        sync(scratch)
+        scratch.replace(path)
+    except OSError:
+        scratch.unlink(missing_ok=True)
+        raise
     return entries[: last + 1].count(None)
 
 
@@ -228,7 +236,7 @@ class Tracker:
       say: prints a warning.
 
     Raises:
-      OSError: a file cannot be written, here and in every method.
+      OSError: `metrics.jsonl` or a video cannot be written, here and in every method.
     """
 
     def __init__(
@@ -295,8 +303,8 @@ class Tracker:
                 self._drop_board(error)
 
     def _drop_board(self, error: Exception) -> None:
-        """The run goes on without TensorBoard, unless its files cannot be written."""
-        if isinstance(error, OSError):
+        """The run goes on without TensorBoard, unless the disk is full."""
+        if isinstance(error, OSError) and error.errno in FULL:
             raise error
         self._board = None
         reason = (str(error).strip() or repr(error)).splitlines()[0][:200]

@@ -54,6 +54,8 @@ def find(logdir: str | os.PathLike[str], items: Collection[str] | None = None) -
     for path in folders.complete(logdir):
         try:
             manifest = manifest_lib.read(path)
+            if manifest.env_steps != int(path.name):
+                raise Damaged(path, f"holds the manifest of {manifest.env_steps} env steps")
             verify(path, manifest, manifest.leaves if items is None else items)
         except Damaged as error:
             if path not in folders.complete(logdir):  # its run goes on, and deletes old ones

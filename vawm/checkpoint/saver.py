@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import concurrent.futures
 import os
+import pathlib
 import time
 from collections.abc import Callable, Mapping
 from types import TracebackType
@@ -19,9 +20,13 @@ from vawm.checkpoint import folders, snapshot, writing
 from vawm.checkpoint.snapshot import Snapshot
 from vawm.checkpoint.writing import SaveError, Written
 from vawm.config import Config
+from vawm.manifest import sync
 from vawm.types import EnvSpec, PyTree
 
 Log = Callable[[dict[str, Any]], None]
+SLOW, SLOW_SECONDS = 0.1, 1.0
+"""The share of the time between two saves in which training may wait for the disk, and the
+seconds up to which nobody minds."""
 
 
 class Pending(NamedTuple):
@@ -43,9 +48,13 @@ class Saver:
       logdir: the folder of the run.
       config: of the run; `save_minutes` counts from here, and from each save on.
       spec: of the environment.
+      before: a file that has to be on the disk, as it was when a save began, before the
+        checkpoint is complete: so that a machine that fails leaves none that is ahead of it.
       log: takes a line about each complete checkpoint, once the caller hears of it:
         `checkpoint/bytes` of its files, `checkpoint/seconds` until it was complete and older
         ones were deleted, `checkpoint/blocked_seconds` of those in which the caller waited.
+      say: prints a warning, the first time that a save takes so long that the next one holds
+        the caller up for more than `SLOW` of the time between the two.
     """
 
     def __init__(
@@ -54,9 +63,12 @@ class Saver:
         config: Config,
         spec: EnvSpec,
         *,
+        before: pathlib.Path | None = None,
         log: Log = lambda _: None,
+        say: Callable[[str], None] = print,
     ):
-        self.logdir, self._config, self._spec, self._log = logdir, config, spec, log
+        self.logdir, self._config, self._spec, self._before = logdir, config, spec, before
+        self._log, self._say, self._told = log, say, False
         self._thread = concurrent.futures.ThreadPoolExecutor(1, thread_name_prefix="saver")
         self._pending: Pending | None = None
         self._last = time.monotonic()
@@ -80,8 +92,10 @@ class Saver:
           SaveError: the save before failed, there is a checkpoint as new as this, or the
             folder of the run is gone.
         """
+        due = time.monotonic()
         self.wait()
         began = time.monotonic()
+        self._tell_if_slow(waited=began - due, interval=began - self._last)
         if not folders.root(self.logdir).parent.is_dir():  # nobody would look for a new one
             raise SaveError(
                 f"{self.logdir} is gone, so no checkpoint is written; if it was moved, go on "
@@ -97,8 +111,17 @@ class Saver:
             episodes=episodes,
         )
         self._last = time.monotonic()
-        future = self._thread.submit(_write, self.logdir, taken)
+        future = self._thread.submit(_write, self.logdir, taken, self._before)
         self._pending = Pending(env_steps, began, self._last - began, future)
+
+    def _tell_if_slow(self, *, waited: float, interval: float) -> None:
+        if self._told or waited < SLOW_SECONDS or waited < SLOW * interval:
+            return
+        self._told = True
+        self._say(
+            f"warning: training waited {waited:.0f} s of {interval:.0f} s for the disk, which "
+            "does not keep up: use a larger --save-every and --save-minutes"
+        )
 
     def check(self) -> None:
         """Hears of a save that is done; never waits.
@@ -148,5 +171,9 @@ class Saver:
             self._thread.shutdown()
 
 
-def _write(logdir: str | os.PathLike[str], taken: Snapshot) -> tuple[Written, float]:
+def _write(
+    logdir: str | os.PathLike[str], taken: Snapshot, before: pathlib.Path | None
+) -> tuple[Written, float]:
+    if before is not None and before.exists():
+        sync(before)
     return writing.write(logdir, taken), time.monotonic()

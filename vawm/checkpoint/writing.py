@@ -107,6 +107,7 @@ def refuse_backwards(logdir: str | os.PathLike[str], env_steps: int) -> None:
 def _manifest(taken: Snapshot) -> Manifest:
     return Manifest(
         version=manifest_lib.version(),
+        computed=manifest_lib.computed(),
         env_steps=taken.env_steps,
         config=taken.config,
         spec=taken.spec,
