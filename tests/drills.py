@@ -18,7 +18,7 @@ All drills, and the tests or the programs of this file that are they:
         drills::kill
         test_runner::test_k_steps_and_the_rest_equal_a_run_in_one_piece
         test_host_train::test_a_run_that_is_resumed_equals_one_in_one_piece
- 3  SIGTERM and SIGINT: a checkpoint, exit codes 143 and 130; the second signal ends at once
+ 3  SIGTERM, SIGINT, SIGHUP: a checkpoint, exit codes 143, 130, 129; the second ends at once
         drills::term
         test_runner::test_a_run_that_a_signal_stopped_goes_on_as_if_nothing_had_happened
         test_signals::test_signals_end_a_process_with_the_code_that_shells_expect
@@ -35,11 +35,13 @@ All drills, and the tests or the programs of this file that are they:
         test_checkpoint_damage::test_only_empty_folders_are_no_reason_to_start_over
         test_resume::test_a_run_whose_checkpoints_are_gone_is_not_started_over
         test_resume::test_a_run_that_saved_by_the_clock_is_not_started_over_either
+        test_rundir::test_files_that_are_not_of_a_run_are_not_put_aside
  6  A full disk while saving and while logging
         drills::full
         test_runner::test_a_disk_that_is_full_when_saving_ends_the_run_and_keeps_the_checkpoint
         test_runner::test_a_full_disk_is_explained_in_one_line
         test_tracking::test_a_full_disk_is_an_error_of_the_line_that_meets_it
+        test_display::test_a_run_outlives_its_standard_output
  7  A folder that cannot be written to
         test_rundir::test_a_path_through_a_file_is_refused
         test_rundir::test_a_folder_without_permission_is_refused
@@ -48,10 +50,12 @@ All drills, and the tests or the programs of this file that are they:
  8  Two runs in one folder; the lock of a dead process
         test_rundir::test_a_second_claim_is_refused_and_names_the_holder
         test_rundir::test_the_lock_of_a_killed_process_is_free
+        test_rundir::test_a_file_system_without_locks_is_a_warning
  9  Rewards that are NaN, once and every time
         test_host_train::test_what_is_not_finite_ends_the_run_with_environment_step_and_field
         test_host_train::test_where_environments_may_restart_what_is_not_finite_is_never_learned_from
         test_envs_host_pool::test_failures_without_a_step_between_them_end_the_pool
+        test_runner::test_one_step_that_is_not_finite_stops_the_run_before_it_is_saved
         test_runner::test_rewards_that_are_nan_in_replay_stop_the_run_and_are_named
         test_train::test_a_nan_in_the_physics_ends_that_episode_and_is_never_stored
 10  Infinite and huge observations, and actions
@@ -80,6 +84,7 @@ All drills, and the tests or the programs of this file that are they:
 14  Choices with a typo, of a wrong type, or that do not go together
         drills::fuzz
         test_fuzz::test_a_config_is_refused_by_the_name_of_a_choice_or_not_at_all
+        test_fuzz::test_so_is_one_for_images_in_any_suite_on_the_host
         test_flags::test_an_error_names_flag_value_and_remedy
         test_validate::test_bad_values_come_with_a_remedy
 15  Checkpoints of another size, task or version
@@ -88,11 +93,15 @@ All drills, and the tests or the programs of this file that are they:
         test_resume::test_another_choice_is_refused_by_name
         test_checkpoint_hostile::test_a_manifest_that_says_something_else_is_refused
         test_rundir::test_a_config_of_another_version_says_which_and_what_to_do
+        test_resume::test_what_another_version_began_is_refused_though_it_could_be_read
+        test_export::test_a_policy_of_another_version_is_told_in_the_log
 16  Malicious checkpoints
         test_checkpoint_hostile::test_a_pickle_in_the_place_of_any_file_is_not_executed
         test_checkpoint_hostile::test_a_file_elsewhere_is_refused
         test_checkpoint_hostile::test_a_link_is_refused_though_what_it_leads_to_is_right
         test_checkpoint_hostile::test_a_huge_manifest_is_not_read
+        test_checkpoint_hostile::test_small_files_do_not_unfold_into_huge_parameters
+        test_memory::test_a_policy_that_does_not_fit_is_refused_with_the_numbers
         test_export::test_a_damaged_file_is_one_line
 17  More than memory holds
         test_memory::test_five_million_images_are_refused_with_the_numbers
@@ -106,6 +115,7 @@ All drills, and the tests or the programs of this file that are they:
 19  A further backend that is down
         test_backends::test_a_backend_that_fails_is_one_warning_and_the_run_goes_on
         test_backends::test_a_backend_that_hangs_costs_a_bounded_wait_at_the_end
+        test_backends::test_a_run_that_was_begun_goes_on_without_a_package_that_is_gone
         test_runner::test_a_tracker_that_fails_changes_nothing_but_one_line_of_output
 20  Steps that go backwards, clocks that jump
         test_checkpoint::test_a_run_does_not_go_backwards

@@ -14,17 +14,26 @@ from collections.abc import Callable
 
 import jax
 import tiny
+import tiny_pixels
 import tiny_storm
 import tiny_vagram
 from hypothesis import strategies as st
 
+from vawm import config as config_lib
 from vawm import diagnosis, runner, train, validate
 from vawm.agent import make_agent
 from vawm.config import Config
 from vawm.errors import InvalidInput
+from vawm.types import EnvSpec
 
 STEPS = 50  # of a config that does not come to its second update before
 
+PIXELS = {
+    suite: dataclasses.replace(tiny_pixels.CONFIG, suite=suite, env=kind(workers=1))
+    for suite, kind in config_lib.ENV_CONFIGS.items()
+    if issubclass(kind, config_lib.HostEnvConfig)
+}
+"""From images, in environments of every suite on the host."""
 BASES = {"dreamerv3": tiny.CONFIG, "storm": tiny_storm.CONFIG, "vagram": tiny_vagram.CONFIG}
 
 USUAL_INTS = st.integers(1, 9) | st.sampled_from([0, 16, 24, 32, 48, 64, 200])
@@ -49,9 +58,19 @@ def value_of(kind: typing.Any) -> st.SearchStrategy:
     return st.one_of(usual, usual, usual, INTS if kind is int else FLOATS, JUNK)
 
 
+class Nothing:
+    """In the place of `tiny_pixels.pool()`: what is known before any process is started."""
+
+    spec = EnvSpec("lamp", tiny_pixels.Lamp.obs, 2, True, tiny.CONFIG.num_envs, 1, 4)
+    restarts = 0
+
+    def close(self):
+        pass
+
+
 @st.composite
-def configs(draw: st.DrawFn) -> Config:
-    config = BASES[draw(st.sampled_from(sorted(BASES)))]
+def configs(draw: st.DrawFn, bases: typing.Mapping[str, Config] = BASES) -> Config:
+    config = bases[draw(st.sampled_from(sorted(bases)))]
     fields = list(validate.fields(config))
     count = draw(st.integers(1, 4))
     chosen = draw(st.lists(st.sampled_from(fields), min_size=count, max_size=count))
@@ -68,7 +87,7 @@ def replace(config: typing.Any, name: str, value: typing.Any) -> typing.Any:
     return dataclasses.replace(config, **{head: value})
 
 
-NAMES = {name for base in BASES.values() for name, _ in validate.values(base)}
+NAMES = {name for b in (BASES | PIXELS).values() for name, _ in validate.values(b)}
 NAMES |= {"world_model", "optimizer", "env"}
 
 
@@ -76,7 +95,7 @@ def refusal(config: Config, folder: pathlib.Path) -> str:
     """Why `config` is refused, in one line that begins with the name of a choice; or ""."""
     try:
         runner.check(config, folder, resume=False, known_task=False)
-        runner.prepare(config, tiny.env())
+        runner.prepare(config, tiny.env() if config.suite == "dmc_proprio" else Nothing())
     except InvalidInput as error:
         if error.field not in NAMES or "\n" in str(error):
             raise AssertionError(f"not one line about a choice: {error}") from error

@@ -17,6 +17,14 @@ def test_a_config_is_refused_by_the_name_of_a_choice_or_not_at_all(config):
     assert not NOWHERE.exists()
 
 
+@hypothesis.given(fuzz.configs(fuzz.PIXELS))
+@hypothesis.settings(max_examples=120)
+def test_so_is_one_for_images_in_any_suite_on_the_host(config):
+    """What is accepted is traced as far as its first state: `prepare` does that."""
+    fuzz.refusal(config, NOWHERE)
+    assert not NOWHERE.exists()
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_what_is_not_refused_trains(seed):
     accepted = []
