@@ -7,8 +7,8 @@
 Runs what is missing under `--runs`, `--jobs` at a time (on Linux each on cores of its own),
 and writes `curves_<experiment>.csv` and `.png` to `--results`, of another agent than dreamerv3
 `curves_<experiment>_<agent>`. Interrupted runs are resumed, finished ones left alone; runs that
-were begun with other settings are refused. Ctrl-C and SIGTERM stop the runs too, which save
-before they end.
+were begun with other settings are refused. Ctrl-C, SIGTERM and SIGHUP stop the runs too, which
+save before they end.
 """
 
 from __future__ import annotations

@@ -41,7 +41,7 @@ All drills, and the tests or the programs of this file that are they:
         test_runner::test_a_disk_that_is_full_when_saving_ends_the_run_and_keeps_the_checkpoint
         test_runner::test_a_full_disk_is_explained_in_one_line
         test_tracking::test_a_full_disk_is_an_error_of_the_line_that_meets_it
-        test_display::test_a_run_outlives_its_standard_output
+        test_streams::test_a_program_outlives_its_standard_output
  7  A folder that cannot be written to
         test_rundir::test_a_path_through_a_file_is_refused
         test_rundir::test_a_folder_without_permission_is_refused

@@ -2,8 +2,6 @@
 
 import io
 import re
-import subprocess
-import sys
 
 import pytest
 import rich.console
@@ -12,34 +10,6 @@ from vawm.display import Display
 from vawm.tracking import Interval
 
 CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
-
-
-# Goes on after the pipe that it writes to has lost its reader, and ends in order.
-SCRIPT = """
-import sys, time
-from vawm.display import standard_output
-
-console = standard_output()
-for number in range(200):
-    console.print(f"line {number}", soft_wrap=True)
-    time.sleep(0.01)
-sys.stderr.write("the end")
-"""
-
-
-@pytest.mark.parametrize("where", ["pipe", "/dev/full"])
-def test_a_run_outlives_its_standard_output(where):
-    out = subprocess.PIPE if where == "pipe" else open(where, "w")  # noqa: SIM115
-    with subprocess.Popen(
-        [sys.executable, "-c", SCRIPT], stdout=out, stderr=subprocess.PIPE, text=True
-    ) as process:
-        if where == "pipe":
-            assert process.stdout.readline() == "line 0\n"
-        (process.stdout or out).close()
-        told = process.stderr.read()
-        assert process.wait(timeout=60) == 0
-    reason = "Broken pipe" if where == "pipe" else "No space left on device"
-    assert told == f"warning: standard output is gone ({reason}); the run goes on\nthe end"
 
 
 class Clock:

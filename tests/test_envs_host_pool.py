@@ -736,6 +736,16 @@ def test_what_simulators_started_ends_with_a_parent_that_is_killed():
         assert wait_until(lambda: not any(map(alive, running)))
 
 
+def test_chatter_that_nobody_can_hear_is_no_failure():
+    with script("loud", "main") as (process, workers):
+        process.stderr.close()
+        assert all(map(alive, workers))
+        process.stdin.write("go on\n")
+        process.stdin.flush()
+        assert process.stdout.readline() == "done\n"
+        assert process.wait(timeout=30) == 0
+
+
 def test_ctrl_c_is_for_the_parent_and_chatter_for_standard_error():
     with script("loud", "main") as (process, workers):
         os.killpg(process.pid, signal.SIGINT)

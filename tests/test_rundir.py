@@ -76,6 +76,18 @@ def test_a_second_claim_is_refused_and_names_the_holder(tmp_path):
         pass
 
 
+@pytest.mark.parametrize(
+    ("number", "told"), [(errno.EACCES, "is in use by"), (errno.EIO, "Input/output error")]
+)
+def test_any_other_error_of_a_lock_is_one(tmp_path, monkeypatch, number, told):
+    def flock(*_):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(rundir.fcntl, "flock", flock)
+    with pytest.raises((InvalidInput, OSError), match=told), rundir.claim(tmp_path):
+        pytest.fail("entered")
+
+
 @pytest.mark.parametrize("number", [errno.ENOSYS, errno.ENOLCK])
 def test_a_file_system_without_locks_is_a_warning(tmp_path, monkeypatch, number):
     def flock(*_):
@@ -89,17 +101,28 @@ def test_a_file_system_without_locks_is_a_warning(tmp_path, monkeypatch, number)
     assert line.startswith(f"WARNING: the file system of {tmp_path} has no locks (")
 
 
-@pytest.mark.parametrize("names", [[], ["lock"], ["config.json", "a"], ["metrics.jsonl"]])
-def test_a_run_may_start_over_where_one_is_or_nothing(tmp_path, names):
-    for name in names:
+def test_a_run_may_start_over_where_one_is_or_nothing(tmp_path):
+    rundir.check_fresh(tmp_path / "not there")
+    rundir.check_fresh(tmp_path)
+    for name in ("lock", "replaced-12"):
         (tmp_path / name).touch()
     rundir.check_fresh(tmp_path)
-    rundir.check_fresh(tmp_path / "not there")
+    (tmp_path / "notes").touch()
+    rundir.write_config(tmp_path, tiny.CONFIG)
+    rundir.check_fresh(tmp_path)
+    (tmp_path / "config.json").write_text("damaged")
+    (tmp_path / "checkpoints" / "000000000008").mkdir(parents=True)
+    rundir.check_fresh(tmp_path)
 
 
-def test_files_that_are_not_of_a_run_are_not_put_aside(tmp_path):
-    for name in ("lock", "thesis.tex"):
-        (tmp_path / name).touch()
+@pytest.mark.parametrize(
+    "names", [["lock", "thesis.tex"], ["checkpoints", "a"], ["config.json"], ["replaced-notes"]]
+)
+def test_files_that_are_not_of_a_run_are_not_put_aside(tmp_path, names):
+    for name in names:
+        (tmp_path / name).write_text(
+            '{"format": "vawm policy", "schema": 1, "vawm": "", "config": {}}'
+        )
     with pytest.raises(InvalidInput, match="holds files, but no run to start over"):
         rundir.check_fresh(tmp_path)
 

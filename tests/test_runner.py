@@ -324,6 +324,44 @@ def test_what_has_arrived_and_is_not_stored_yet_comes_after_what_is():
     assert diagnosis.nonfinite_steps(state) == [before, now]
 
 
+def test_who_returned_it_is_not_blamed_on_the_environment_where_an_action_came_before():
+    nan = math.nan
+    replay_of_both = stored([[1.0, 1.0], [1.0, nan]])
+    blamed = toy.state()._replace(replay=replay_of_both, collector=arrived())
+    assert diagnosis.advice(blamed).startswith("environment 1 returned reward that is")
+    actions = blamed.replay.trajectory.action
+    same, before = (actions.at[1, slot].set(nan) for slot in newest(blamed.replay, 0, 1))
+    for action, told in (
+        (same, "environment 1 returned"),
+        (before, "Start again with a small"),
+    ):
+        trajectory = blamed.replay.trajectory._replace(action=action)
+        state = blamed._replace(replay=blamed.replay._replace(trajectory=trajectory))
+        assert diagnosis.advice(state).startswith(told)
+        reason = diagnosis.reason(state, {"chunk/nonfinite": 1}, last=False)
+        assert reason.startswith("an action" if told.startswith("Start") else "what an env")
+
+
+def newest(buffer, *ago):
+    """The slots of steps counted back from the newest."""
+    return [(int(buffer.head) - 1 - a) % buffer.trajectory.reward.shape[1] for a in ago]
+
+
+@pytest.mark.parametrize("field", ["reward", "obs"])
+def test_a_first_observation_that_is_not_finite_begins_no_run(tmp_path, field):
+    plain = tiny.env()
+
+    def reset(key):
+        state, timestep = plain.reset(key)
+        value = getattr(timestep, field).at[1].set(jnp.nan)
+        return state, timestep._replace(**{field: value})
+
+    told = f"environment 1 returned {field} that is not finite, before any step: mend what"
+    with pytest.raises(RunError, match=told):
+        run(tiny.CONFIG, tmp_path, env=plain._replace(reset=reset))
+    assert checkpoint.latest(tmp_path) is None
+
+
 class Counted(NamedTuple):
     """The state of an environment, and how often it was stepped."""
 
@@ -359,7 +397,7 @@ def test_one_step_that_is_not_finite_stops_the_run_before_it_is_saved(tmp_path, 
     """Of an environment of one's own on the device. Mended, the run goes on."""
     told = (
         "what an environment returned is not finite at env_steps=40; kept: the checkpoint at "
-        rf"32; .*json. Environment 1 returned {field} that is not finite, 2 steps before the "
+        rf"32; .*json. environment 1 returned {field} that is not finite, 2 steps before the "
         "newest: mend what returned it, then go on with --resume"
     )
     with pytest.raises(RunError, match=told):  # call 22 of the 24 of six chunks
@@ -398,7 +436,7 @@ def test_rewards_that_are_nan_in_replay_stop_the_run_and_are_named(tmp_path, mon
         RunError, match=r"loss/.* is nan at .*; more in .*diagnosis.json"
     ) as error:
         run(tiny.CONFIG, tmp_path)
-    assert "Environment 1 returned reward that is not finite" in str(error.value)
+    assert "environment 1 returned reward that is not finite" in str(error.value)
     found = json.loads((tmp_path / "diagnosis.json").read_text())
     ago = 4 * len(chunks) - 1  # 4 calls in a chunk
     assert found["nonfinite_replay"] == [

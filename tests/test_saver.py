@@ -107,7 +107,7 @@ def test_metrics_are_on_the_disk_before_a_checkpoint_is_complete(tmp_path, monke
     monkeypatch.setattr(saver_lib, "sync", synced)
     with checkpoint.Saver(tmp_path, tiny.CONFIG, toy.SPEC, before=metrics) as saving:
         saving.save(toy.state(8), env_steps=8, progress={})
-    assert order == [metrics]
+    assert order == [metrics, tmp_path]
     assert checkpoint.latest(tmp_path) is not None
 
 

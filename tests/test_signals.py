@@ -58,23 +58,25 @@ def test_the_handlers_of_before_come_back():
     assert stop.exit_code == 143
 
 
-def test_what_is_ignored_stays_ignored():
-    """As SIGHUP is under `nohup`."""
-    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+def test_sighup_stays_ignored_and_sigint_does_not():
+    """The one is ignored under `nohup`, the other in what a script starts with `&`."""
+    numbers = signal.SIGHUP, signal.SIGINT
+    before = [signal.signal(number, signal.SIG_IGN) for number in numbers]
     try:
         with signals.catch() as stop:
-            os.kill(os.getpid(), signal.SIGHUP)
-            os.kill(os.getpid(), signal.SIGTERM)
+            for number in numbers:
+                os.kill(os.getpid(), number)
             wait_for(lambda: stop.signal is not None)
-            assert stop.signal == signal.SIGTERM
-        assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+            assert stop.signal == signal.SIGINT
+        assert [signal.getsignal(number) for number in numbers] == [signal.SIG_IGN] * 2
     finally:
-        signal.signal(signal.SIGHUP, before)
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
 
 
 def test_a_notice_that_nobody_can_read_does_not_end_the_listening():
     def notice():
-        raise OSError("the terminal is closed")
+        raise ValueError("the terminal is closed")
 
     with signals.catch(notice) as stop:
         os.kill(os.getpid(), signal.SIGHUP)

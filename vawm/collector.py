@@ -103,8 +103,10 @@ def is_finite(arrived: PyTree) -> Array:
     def per_env(x: Array) -> Array:
         return jnp.isfinite(x).all(range(1, x.ndim))
 
-    floating = (x for x in jax.tree.leaves(arrived) if jnp.issubdtype(x.dtype, jnp.floating))
-    return functools.reduce(jnp.logical_and, map(per_env, floating))
+    leaves = jax.tree.leaves(arrived)
+    floating = (x for x in leaves if jnp.issubdtype(x.dtype, jnp.floating))
+    anyway = jnp.ones(leaves[0].shape[0], bool)
+    return functools.reduce(jnp.logical_and, map(per_env, floating), anyway)
 
 
 def make_collect(env: Environment, agent: Agent, config: Config) -> Collect:

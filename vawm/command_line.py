@@ -18,7 +18,7 @@ from typing import Annotated, NamedTuple
 
 import tyro
 
-from vawm import cache, presets, resume, runner, validate
+from vawm import cache, presets, resume, runner, streams, validate
 from vawm import config as config_lib
 from vawm import flags as flags_lib
 from vawm.checkpoint import SaveError
@@ -233,6 +233,7 @@ def _updates(config: Config) -> int:
     return max(0, replayed) * config.train_ratio // config.replay.batch_steps
 
 
+@streams.outlive()
 def guard(main: Callable[[], int]) -> int:
     """The exit code of `main`; what can go wrong becomes one line on standard error.
 

@@ -72,7 +72,9 @@ def reason(state: TrainState, metrics: Mapping[str, Any], *, last: bool) -> str 
     next update would tell.
     """
     if int(metrics["chunk/nonfinite"]):
-        return "what an environment returned is not finite"
+        if _returned(nonfinite_steps(state)):
+            return "what an environment returned is not finite"
+        return "an action is not finite"
     if loss := first_nonfinite(metrics):
         return f"{loss} is {float(metrics[loss])}"
     if last and (params := nonfinite_parameters(state)):
@@ -139,15 +141,27 @@ def nonfinite_replay(replay: Replay) -> list[dict[str, Any]]:
 
 def advice(state: TrainState) -> str:
     """What to do about a run that has come to `state`, in one sentence."""
-    found = nonfinite_steps(state)
-    if not found:
+    first = _returned(nonfinite_steps(state))
+    if first is None:
         return "Start again with a smaller --optimizer.learning-rate or another --seed"
-    first = found[0]
-    return (
-        f"Environment {first['environment']} returned {first['field']} that is not finite, "
-        f"{first['steps_ago'] + 1} steps before the newest: mend what returned it, then go on "
-        "with --resume"
-    )
+    ago = f"{first['steps_ago'] + 1} steps before the newest"
+    return f"{where(first)}, {ago}: mend what returned it, then go on with --resume"
+
+
+def where(found: Mapping[str, Any]) -> str:
+    """An entry of `nonfinite_steps`, in words."""
+    return f"environment {found['environment']} returned {found['field']} that is not finite"
+
+
+def _returned(found: list[dict[str, Any]]) -> dict[str, Any] | None:
+    """The first of `nonfinite_steps` that an environment returned; None if an action came
+    before it, which is what is wrong then."""
+    returned = [entry for entry in found if not entry["field"].startswith("action")]
+    actions = [entry["steps_ago"] for entry in found if entry["field"].startswith("action")]
+    first = max(returned, key=lambda entry: entry["steps_ago"], default=None)
+    if first is None or max(actions, default=-1) > first["steps_ago"]:
+        return None
+    return first
 
 
 @jax.jit

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
-import sys
 from types import TracebackType
-from typing import IO, Any
 
 import rich.console
 import rich.progress
@@ -15,53 +11,6 @@ from vawm.tracking import Interval, Line
 
 SPEED_SECONDS = 600.0
 """How far back the speed behind the ETA looks; two chunks have to fit in, or there is none."""
-
-
-class Lasting:
-    """Standard output that a run outlives: once it cannot be written, nothing is.
-
-    A pipe whose reader ended, a terminal that was closed, a file on a disk that is full: none
-    of them is a reason to lose a run, whose metrics are in its folder.
-    """
-
-    def __init__(self, file: IO[str]):
-        self._file, self._gone = file, False
-
-    def write(self, text: str) -> int:
-        if not self._gone:
-            try:
-                return self._file.write(text)
-            except OSError as error:
-                self._lose(error)
-        return len(text)
-
-    def flush(self) -> None:
-        if not self._gone:
-            try:
-                self._file.flush()
-            except OSError as error:
-                self._lose(error)
-
-    def _lose(self, error: OSError) -> None:
-        self._gone = True
-        with contextlib.suppress(OSError):
-            nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, self._file.fileno())  # where Python flushes what is left, at exit
-            os.close(nowhere)
-        with contextlib.suppress(OSError):
-            print(
-                f"warning: standard output is gone ({error.strerror}); the run goes on",
-                file=sys.stderr,
-                flush=True,
-            )
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._file, name)
-
-
-def standard_output() -> rich.console.Console:
-    """The console of a run."""
-    return rich.console.Console(file=Lasting(sys.stdout))  # type: ignore[arg-type]
 
 
 class Display:

@@ -160,7 +160,7 @@ tags: [reinforcement-learning, world-model, jax]
 ## Use
 
 ```python
-{_usage(config)}
+{_usage(policy)}
 ```
 
 Evaluate it with `python -m vawm.evaluate --logdir FOLDER`. All choices of the training are in
@@ -172,11 +172,14 @@ Apache-2.0, as vawm itself.
 """
 
 
-def _usage(config: Config) -> str:
+def _usage(policy: Policy) -> str:
     """The lines that load the policy and act once."""
+    config = policy.config
     try:
         suites.check_task(config)
     except InvalidInput:
+        return OWN_USAGE
+    if policy.spec.task != config.task:
         return OWN_USAGE
     return HOST_USAGE if isinstance(config.env, HostEnvConfig) else USAGE
 

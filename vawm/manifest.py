@@ -127,7 +127,7 @@ def version() -> str:
 
 def computed() -> str:
     """With which JAX this process computes, and on what."""
-    return f"jax {jax.__version__} on {jax.default_backend()}"
+    return f"jax {jax.__version__} on {jax.devices()[0].device_kind}"
 
 
 def spec_as_dict(spec: EnvSpec) -> dict[str, Any]:

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import json
 import os
 import pathlib
+import re
 import socket
 from collections.abc import Callable, Iterator
+from typing import Any
 
 from vawm import config as config_lib
 from vawm import manifest as manifest_lib
 from vawm.config import Config
 from vawm.errors import InvalidInput
 
+NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.EINVAL)
 LOCK, CONFIG, REPLACED = "lock", "config.json", "replaced-"
 
 
@@ -56,9 +60,10 @@ def check_fresh(logdir: pathlib.Path) -> None:
       InvalidInput: `put_aside` would move files of which this package knows nothing.
     """
     check_writable(logdir)
-    of_a_run = (CONFIG, "checkpoints", "metrics.jsonl", f"{REPLACED}*")
-    found = [p for p in logdir.iterdir() if p.name != LOCK] if logdir.is_dir() else []
-    if found and not any(path.match(name) for path in found for name in of_a_run):
+    names = [path.name for path in logdir.iterdir()] if logdir.is_dir() else []
+    others = [n for n in names if n != LOCK and not re.fullmatch(rf"{REPLACED}\d+", n)]
+    saved = any(logdir.glob(f"checkpoints/{'[0-9]' * 12}"))
+    if others and not saved and _content(logdir / CONFIG) is None:
         remedy = "holds files, but no run to start over; choose another --logdir"
         raise InvalidInput("logdir", str(logdir), remedy)
 
@@ -82,12 +87,14 @@ def claim(logdir: pathlib.Path, *, say: Callable[[str], None] = print) -> Iterat
     with file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
+        except (BlockingIOError, PermissionError) as error:
             file.seek(0)
             holder = file.read().strip() or "another process"
             remedy = f"is in use by {holder}; wait for it or choose another --logdir"
             raise InvalidInput("logdir", str(logdir), remedy) from error
         except OSError as error:
+            if error.errno not in NO_LOCKS:
+                raise
             say(
                 f"WARNING: the file system of {logdir} has no locks ({error.strerror}): "
                 "nothing keeps a second run out of this folder"
@@ -125,17 +132,25 @@ def read_config(logdir: pathlib.Path) -> Config | None:
       OtherVersion: it has other choices than this one knows.
     """
     path = logdir / CONFIG
-    try:
-        content = json.loads(path.read_text())
-    except (OSError, ValueError, RecursionError):
-        return None
-    if not isinstance(content, dict) or not {"schema", "vawm", "config"} <= content.keys():
+    content = _content(path)
+    if content is None:
         return None
     try:
         return manifest_lib.config_from_dict(content["config"])
     except InvalidInput as error:
         written = content["vawm"]
         raise manifest_lib.OtherVersion("logdir", path, error, written=written) from error
+
+
+def _content(path: pathlib.Path) -> dict[str, Any] | None:
+    """What `write_config` wrote; None where it is something else."""
+    try:
+        content = json.loads(path.read_text())
+    except (OSError, ValueError, RecursionError):
+        return None
+    if not isinstance(content, dict) or not {"schema", "vawm", "config"} <= content.keys():
+        return None
+    return None if "format" in content else content  # of an exported policy
 
 
 def put_aside(logdir: pathlib.Path) -> pathlib.Path | None:

@@ -26,6 +26,7 @@ from vawm import (
     memory,
     rundir,
     signals,
+    streams,
     suites,
     tracking,
     validate,
@@ -35,7 +36,7 @@ from vawm import manifest as manifest_lib
 from vawm import program as program_lib
 from vawm import resume as resume_lib
 from vawm.config import Config
-from vawm.display import Display, standard_output
+from vawm.display import Display
 from vawm.envs.protocol import Environment, EnvironmentFailure, HostEnvironment
 from vawm.errors import InvalidInput
 from vawm.program import Program
@@ -79,6 +80,7 @@ class Result(NamedTuple):
     exit_code: int
 
 
+@streams.outlive()
 def run(
     config: Config,
     logdir: str | pathlib.Path,
@@ -111,7 +113,7 @@ def run(
       SaveError: a checkpoint could not be written.
     """
     logdir = pathlib.Path(logdir).expanduser()
-    console = console or standard_output()
+    console = console or rich.console.Console()
     say = functools.partial(console.print, highlight=False, soft_wrap=True, markup=False)
     with contextlib.ExitStack() as stack:
         stack.enter_context(_explained(logdir))
@@ -133,9 +135,16 @@ def run(
                 say(f"no checkpoint in {logdir} yet: this run starts from the beginning")
             rundir.write_config(logdir, config)
             state, progress = program.init(config.seed), Progress()
+        _refuse_nonfinite(state)
         result = _loop(config, logdir, program, state, progress, console)
     _summarise(config, result, say, command, known_task=env is None)
     return result
+
+
+def _refuse_nonfinite(state: PyTree) -> None:
+    """Refuses to begin, or to go on, with steps that are not finite: none is ever saved."""
+    if found := diagnosis.nonfinite_steps(state):
+        raise RunError(f"{diagnosis.where(found[0])}, before any step: mend what returned it")
 
 
 def check(

@@ -32,14 +32,15 @@ def catch(notify: Callable[[], None] = lambda: None) -> Iterator[Stop]:
 
     A thread hears of signals through a pipe, because Python runs its own handlers only
     between two calls of compiled code, which can be minutes apart. Outside the main
-    thread signals cannot be caught, and nothing is. What is ignored stays so, as SIGHUP is
-    under `nohup`.
+    thread signals cannot be caught, and nothing is. SIGHUP stays ignored where it is, as
+    under `nohup`; SIGINT does not, which a script ignores for all that it starts with `&`.
 
     Args:
       notify: called at the first signal, in that thread.
     """
     stop, asked = Stop(), 0.0
-    caught = [number for number in SIGNALS if signal.getsignal(number) != signal.SIG_IGN]
+    ignored = signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+    caught = [number for number in SIGNALS if number != signal.SIGHUP or not ignored]
     if threading.current_thread() is not threading.main_thread():
         yield stop
         return
@@ -53,7 +54,7 @@ def catch(notify: Callable[[], None] = lambda: None) -> Iterator[Stop]:
                 continue
             if stop.signal is None:
                 stop.signal, asked = received[0], time.monotonic()
-                with contextlib.suppress(OSError):  # a closed terminal takes no line
+                with contextlib.suppress(Exception):  # a closed terminal takes no line
                     notify()
             elif time.monotonic() - asked > BURST_SECONDS:
                 os._exit(128 + received[0])

@@ -160,6 +160,7 @@ def truncate(path: str | os.PathLike[str], env_steps: int) -> int:
         scratch.write_text("".join(as_json(entry) + "\n" for entry in kept))
         sync(scratch)
         scratch.replace(path)
+        sync(path.parent)
     except OSError:
         scratch.unlink(missing_ok=True)
         raise

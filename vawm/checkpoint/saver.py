@@ -176,4 +176,5 @@ def _write(
 ) -> tuple[Written, float]:
     if before is not None and before.exists():
         sync(before)
+        sync(before.parent)
     return writing.write(logdir, taken), time.monotonic()

@@ -41,9 +41,9 @@ class Outcome(NamedTuple):
 def run(jobs: Sequence[Job], *, at_once: int) -> Outcome:
     """Keeps `at_once` jobs going, on Linux each with its share of the cores.
 
-    At Ctrl-C or SIGTERM no further one is started; those that are running get a SIGTERM, upon
-    which a run of ours saves, and this returns when all have ended. At a second signal this
-    process ends at once, and they go on saving.
+    At Ctrl-C, SIGTERM or SIGHUP no further one is started; those that run get a SIGTERM, upon
+    which a run of ours saves, and this returns when all have ended. At a second signal
+    this process ends at once, and they go on saving.
     """
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
     shares = [cores[i::at_once] for i in range(at_once)]

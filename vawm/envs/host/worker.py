@@ -28,6 +28,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from vawm import streams
 from vawm.envs.host.channel import Channel, Fields, view
 from vawm.envs.host.simulator import Outcome, Simulator
 from vawm.errors import InvalidInput
@@ -318,6 +319,7 @@ def sendable(value: Any) -> Any:
 def main() -> None:
     """Serves the pool that started this process; its settings are the last argument."""
     settings = json.loads(sys.argv[-1])
+    sys.stdout, sys.stderr = streams.lasting()  # type: ignore[assignment]
     for name in ("channel", "memory", "crash"):
         os.set_inheritable(settings[name], False)  # not for programs a simulator starts
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
