@@ -115,6 +115,30 @@ def test_a_run_may_start_over_where_one_is_or_nothing(tmp_path):
     rundir.check_fresh(tmp_path)
 
 
+def test_what_was_put_aside_in_part_may_still_start_over(tmp_path, monkeypatch):
+    rundir.write_config(tmp_path, tiny.CONFIG)
+    for name in ("checkpoints", "metrics.jsonl", "videos"):
+        (tmp_path / name).touch()
+    renamed, rename = [], pathlib.Path.rename
+
+    def killed(path, to):
+        if len(renamed) == 2:
+            raise KeyboardInterrupt
+        renamed.append(path.name)
+        return rename(path, to)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(pathlib.Path, "rename", killed)
+        with pytest.raises(KeyboardInterrupt):
+            rundir.put_aside(tmp_path)
+    rundir.check_fresh(tmp_path)
+    rundir.put_aside(tmp_path)
+    (tmp_path / "config.json.tmp").touch()
+    rundir.check_fresh(tmp_path)
+    aside = {p.name for folder in tmp_path.glob("replaced-*") for p in folder.iterdir()}
+    assert aside == {"checkpoints", "metrics.jsonl", "videos", "config.json"}
+
+
 @pytest.mark.parametrize(
     "names", [["lock", "thesis.tex"], ["checkpoints", "a"], ["config.json"], ["replaced-notes"]]
 )

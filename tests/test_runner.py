@@ -31,6 +31,7 @@ from vawm import (
     runner,
     tracking,
 )
+from vawm.agent import Agent
 from vawm.errors import InvalidInput
 from vawm.program import CompiledStep, Program
 from vawm.runner import RunError
@@ -340,6 +341,9 @@ def test_who_returned_it_is_not_blamed_on_the_environment_where_an_action_came_b
         assert diagnosis.advice(state).startswith(told)
         reason = diagnosis.reason(state, {"chunk/nonfinite": 1}, last=False)
         assert reason.startswith("an action" if told.startswith("Start") else "what an env")
+    whole = toy.state()._replace(replay=stored(), collector=arrived())
+    reason = diagnosis.reason(whole, {"chunk/nonfinite": 1}, last=False)
+    assert reason.startswith("what an env")  # and was overwritten since
 
 
 def newest(buffer, *ago):
@@ -356,9 +360,28 @@ def test_a_first_observation_that_is_not_finite_begins_no_run(tmp_path, field):
         value = getattr(timestep, field).at[1].set(jnp.nan)
         return state, timestep._replace(**{field: value})
 
-    told = f"environment 1 returned {field} that is not finite, before any step: mend what"
+    told = f"environment 1 returned {field} that is not finite where the run begins: mend that"
     with pytest.raises(RunError, match=told):
         run(tiny.CONFIG, tmp_path, env=plain._replace(reset=reset))
+    assert checkpoint.latest(tmp_path) is None
+
+
+def test_a_nan_action_that_an_environment_puts_up_with_is_not_saved_either(
+    tmp_path, monkeypatch
+):
+    """That is the policy's fault, and the line says so."""
+    act = Agent.act
+
+    def wild(*args, **kwargs):
+        carry, action = act(*args, **kwargs)
+        action = action.at[1].set(jnp.nan)
+        return carry._replace(action=action), action
+
+    monkeypatch.setattr(Agent, "act", wild)
+    plain = tiny.env()
+    tolerant = plain._replace(step=lambda state, a: plain.step(state, jnp.nan_to_num(a)))
+    with pytest.raises(RunError, match=r"an action is not finite at .* Start again with a"):
+        run(tiny.CONFIG, tmp_path, env=tolerant)
     assert checkpoint.latest(tmp_path) is None
 
 

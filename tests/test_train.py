@@ -131,7 +131,8 @@ def test_two_seeds_vmapped_equal_the_two_runs_alone(compiled, two_seeds):
     init_both, step_both, _ = two_seeds
     together = init_both(keys_of_two())
     for _ in range(7):
-        together, _ = step_both(together)
+        together, metrics = step_both(together)
+    assert metrics["chunk/nonfinite"].tolist() == [0, 0]
     for seed in range(2):
         alone, _ = roll(step, init(keys_of_two()[seed]), 7)
         one = jax.tree.map(lambda x, seed=seed: x[seed], unshare(together, 2))

@@ -74,18 +74,19 @@ def arrive(
 ) -> tuple[Collector, Metrics]:
     """Takes in what an environment answered; `collector` has its new state already.
 
-    Metrics are sums over the episodes that ended in this step, and `chunk/nonfinite`, of how
-    many environments something that arrived is not finite.
+    Metrics are sums over the episodes that ended in this step, and `chunk/nonfinite`: for how
+    many environments what arrived, or the action before it, is not finite.
     """
     moved = ~timestep.is_first
     episode_return = jnp.where(moved, collector.episode_return, 0.0) + timestep.reward
     episode_length = jnp.where(moved, collector.episode_length + 1, 0)
     ended = timestep.is_last
+    exchanged = timestep.obs, timestep.reward, collector.carry.action
     metrics = {
         "episode/count": jnp.sum(ended),
         "episode/return": jnp.sum(jnp.where(ended, episode_return, 0.0)),
         "episode/length": jnp.sum(jnp.where(ended, episode_length, 0)),
-        "chunk/nonfinite": jnp.sum(~is_finite((timestep.obs, timestep.reward))),
+        "chunk/nonfinite": jnp.sum(~is_finite(exchanged)),
     }
     return Collector(
         env_state=collector.env_state,
@@ -97,13 +98,13 @@ def arrive(
     ), metrics
 
 
-def is_finite(arrived: PyTree) -> Array:
-    """Whether all of an environment's arrays `[N, ...]` are finite, `[N]`."""
+def is_finite(exchanged: PyTree) -> Array:
+    """Whether all numbers in arrays `[N, ...]` are, per environment, `[N]`."""
 
     def per_env(x: Array) -> Array:
         return jnp.isfinite(x).all(range(1, x.ndim))
 
-    leaves = jax.tree.leaves(arrived)
+    leaves = jax.tree.leaves(exchanged)
     floating = (x for x in leaves if jnp.issubdtype(x.dtype, jnp.floating))
     anyway = jnp.ones(leaves[0].shape[0], bool)
     return functools.reduce(jnp.logical_and, map(per_env, floating), anyway)

@@ -67,14 +67,14 @@ def write(
 def reason(state: TrainState, metrics: Mapping[str, Any], *, last: bool) -> str | None:
     """Why a run cannot go on after the chunk that led to `state`; None if it can.
 
-    Something that arrived from an environment and is not finite: it would be saved with replay,
+    What an environment returned or was sent and is not finite: it would be saved with replay,
     and be learned from one day. A loss; after the `last` chunk also a parameter: no loss of a
     next update would tell.
     """
     if int(metrics["chunk/nonfinite"]):
-        if _returned(nonfinite_steps(state)):
-            return "what an environment returned is not finite"
-        return "an action is not finite"
+        first = _first(nonfinite_steps(state))
+        acted = first is not None and _is_action(first)
+        return f"{'an action' if acted else 'what an environment returned'} is not finite"
     if loss := first_nonfinite(metrics):
         return f"{loss} is {float(metrics[loss])}"
     if last and (params := nonfinite_parameters(state)):
@@ -141,8 +141,8 @@ def nonfinite_replay(replay: Replay) -> list[dict[str, Any]]:
 
 def advice(state: TrainState) -> str:
     """What to do about a run that has come to `state`, in one sentence."""
-    first = _returned(nonfinite_steps(state))
-    if first is None:
+    first = _first(nonfinite_steps(state))
+    if first is None or _is_action(first):
         return "Start again with a smaller --optimizer.learning-rate or another --seed"
     ago = f"{first['steps_ago'] + 1} steps before the newest"
     return f"{where(first)}, {ago}: mend what returned it, then go on with --resume"
@@ -150,18 +150,18 @@ def advice(state: TrainState) -> str:
 
 def where(found: Mapping[str, Any]) -> str:
     """An entry of `nonfinite_steps`, in words."""
+    if _is_action(found):
+        return f"an action of environment {found['environment']} is not finite"
     return f"environment {found['environment']} returned {found['field']} that is not finite"
 
 
-def _returned(found: list[dict[str, Any]]) -> dict[str, Any] | None:
-    """The first of `nonfinite_steps` that an environment returned; None if an action came
-    before it, which is what is wrong then."""
-    returned = [entry for entry in found if not entry["field"].startswith("action")]
-    actions = [entry["steps_ago"] for entry in found if entry["field"].startswith("action")]
-    first = max(returned, key=lambda entry: entry["steps_ago"], default=None)
-    if first is None or max(actions, default=-1) > first["steps_ago"]:
-        return None
-    return first
+def _first(found: list[dict[str, Any]]) -> dict[str, Any] | None:
+    """The first of `nonfinite_steps`: the cause of the others. Actions follow what they see."""
+    return max(found, key=lambda x: (x["steps_ago"], not _is_action(x)), default=None)
+
+
+def _is_action(found: Mapping[str, Any]) -> bool:
+    return found["field"].startswith("action")
 
 
 @jax.jit

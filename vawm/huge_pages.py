@@ -13,6 +13,7 @@ an update from pixels takes half as long again, whenever its gigabyte is mapped 
 
 from __future__ import annotations
 
+import contextlib
 import os
 import pathlib
 import sys
@@ -44,8 +45,10 @@ def use_huge_pages() -> None:
     if os.environ.get("VAWM_HUGE_PAGES") == "0":
         return
     os.environ["GLIBC_TUNABLES"] = ":".join([*filter(None, [tunables]), *TUNABLES])
-    sys.stdout.flush()
-    sys.stderr.flush()
+    for stream in (sys.stdout, sys.stderr):
+        if stream is not None:  # as where it was closed before this began
+            with contextlib.suppress(OSError, ValueError):
+                stream.flush()
     os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
 
 

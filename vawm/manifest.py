@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import hashlib
 import importlib.metadata
 import json
@@ -231,10 +232,16 @@ def sha256(path: pathlib.Path) -> str:
 
 
 def sync(path: pathlib.Path) -> None:
-    """Returns when a file, or the names in a folder, are on the disk and not in a buffer."""
+    """Returns when a file, or the names in a folder, are on the disk and not in a buffer.
+
+    Some file systems refuse that for folders; there it is theirs to keep the order.
+    """
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP) or not path.is_dir():
+            raise
     finally:
         os.close(descriptor)
 

@@ -18,6 +18,7 @@ from vawm import manifest as manifest_lib
 from vawm.config import Config
 from vawm.errors import InvalidInput
 
+HELD = (errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES)
 NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.EINVAL)
 LOCK, CONFIG, REPLACED = "lock", "config.json", "replaced-"
 
@@ -61,7 +62,8 @@ def check_fresh(logdir: pathlib.Path) -> None:
     """
     check_writable(logdir)
     names = [path.name for path in logdir.iterdir()] if logdir.is_dir() else []
-    others = [n for n in names if n != LOCK and not re.fullmatch(rf"{REPLACED}\d+", n)]
+    ours = rf"{LOCK}|{re.escape(CONFIG)}\.tmp|{REPLACED}\d+"
+    others = [name for name in names if not re.fullmatch(ours, name)]
     saved = any(logdir.glob(f"checkpoints/{'[0-9]' * 12}"))
     if others and not saved and _content(logdir / CONFIG) is None:
         remedy = "holds files, but no run to start over; choose another --logdir"
@@ -87,12 +89,12 @@ def claim(logdir: pathlib.Path, *, say: Callable[[str], None] = print) -> Iterat
     with file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except (BlockingIOError, PermissionError) as error:
-            file.seek(0)
-            holder = file.read().strip() or "another process"
-            remedy = f"is in use by {holder}; wait for it or choose another --logdir"
-            raise InvalidInput("logdir", str(logdir), remedy) from error
         except OSError as error:
+            if error.errno in HELD:
+                file.seek(0)
+                holder = file.read().strip() or "another process"
+                remedy = f"is in use by {holder}; wait for it or choose another --logdir"
+                raise InvalidInput("logdir", str(logdir), remedy) from error
             if error.errno not in NO_LOCKS:
                 raise
             say(
@@ -156,7 +158,8 @@ def _content(path: pathlib.Path) -> dict[str, Any] | None:
 def put_aside(logdir: pathlib.Path) -> pathlib.Path | None:
     """Moves all that is in the folder into a new `replaced-<number>` in it; None if nothing.
 
-    What earlier calls have put aside stays where it is.
+    What earlier calls have put aside stays where it is. `config.json`, by which `check_fresh`
+    knows a run, goes last.
 
     Raises:
       OSError: something cannot be moved.
@@ -169,7 +172,7 @@ def put_aside(logdir: pathlib.Path) -> pathlib.Path | None:
     while (aside := logdir / f"{REPLACED}{number}").exists():
         number += 1
     aside.mkdir()
-    for path in found:
+    for path in sorted(found, key=lambda path: path.name == CONFIG):
         path.rename(aside / path.name)
     return aside
 

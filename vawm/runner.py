@@ -142,9 +142,9 @@ def run(
 
 
 def _refuse_nonfinite(state: PyTree) -> None:
-    """Refuses to begin, or to go on, with steps that are not finite: none is ever saved."""
+    """Refuses first observations that are not finite; of later steps none is ever saved."""
     if found := diagnosis.nonfinite_steps(state):
-        raise RunError(f"{diagnosis.where(found[0])}, before any step: mend what returned it")
+        raise RunError(f"{diagnosis.where(found[0])} where the run begins: mend that")
 
 
 def check(

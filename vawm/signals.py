@@ -54,7 +54,7 @@ def catch(notify: Callable[[], None] = lambda: None) -> Iterator[Stop]:
                 continue
             if stop.signal is None:
                 stop.signal, asked = received[0], time.monotonic()
-                with contextlib.suppress(Exception):  # a closed terminal takes no line
+                with contextlib.suppress(BaseException):  # a closed terminal takes no line
                     notify()
             elif time.monotonic() - asked > BURST_SECONDS:
                 os._exit(128 + received[0])

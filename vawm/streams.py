@@ -9,75 +9,92 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
-from collections.abc import Iterator
+import threading
+from collections.abc import Iterable, Iterator
 from typing import IO, Any
 
 
 class Lasting:
     """A text file that takes what it is given; once it cannot write, it drops it.
 
-    The first time it says so on standard error, as far as that can be heard.
+    The first time it says so on standard error, as far as that can be heard. What is written
+    past it, to `buffer` or `fileno()`, is not its business.
     """
 
-    def __init__(self, file: IO[str] | None, name: str):
+    def __init__(self, file: IO[str], name: str):
         self._file, self._name = file, name
+        self._gone, self._lock = False, threading.Lock()
 
     def write(self, text: str) -> int:
-        if self._file is not None:
+        if not self._gone:
             try:
                 self._file.write(text)
             except UnicodeError:
                 raise
+            except BlockingIOError:  # a pipe that is full for the moment: this text is lost
+                pass
             except (OSError, ValueError) as error:  # ValueError: it was closed
                 self._lose(error)
         return len(text)
 
+    def writelines(self, lines: Iterable[str]) -> None:
+        for line in lines:
+            self.write(line)
+
     def flush(self) -> None:
-        if self._file is not None:
+        if not self._gone:
             try:
                 self._file.flush()
+            except BlockingIOError:
+                pass
             except (OSError, ValueError) as error:
                 self._lose(error)
 
     def _lose(self, error: OSError | ValueError) -> None:
-        file, self._file = self._file, None
-        assert file is not None
+        with self._lock:
+            if self._gone:
+                return
+            self._gone = True
         with contextlib.suppress(OSError, ValueError):
-            nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, file.fileno())  # where Python flushes what is left, at exit
-            os.close(nowhere)
+            if (number := self._file.fileno()) in (1, 2):
+                nowhere = os.open(os.devnull, os.O_WRONLY)
+                os.dup2(nowhere, number)  # where Python flushes what is left, at exit
+                os.close(nowhere)
         why = error.strerror if isinstance(error, OSError) else error
         with contextlib.suppress(OSError, ValueError):
             print(f"warning: {self._name} is gone ({why})", file=sys.stderr, flush=True)
 
-    def isatty(self) -> bool:
-        return self._file is not None and self._file.isatty()
-
     def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):  # while it is being copied it has none of its own
+            raise AttributeError(name)
         return getattr(self._file, name)
-
-
-def lasting() -> tuple[Lasting, Lasting]:
-    """Standard output and standard error of this process, to be put in their places.
-
-    One that was closed before the process began takes everything, too.
-    """
-    return (
-        _lasting(sys.stdout, "standard output"),
-        _lasting(sys.stderr, "standard error"),
-    )
 
 
 @contextlib.contextmanager
 def outlive() -> Iterator[None]:
-    """Inside, `sys.stdout` and `sys.stderr` are `lasting()`."""
+    """Inside, `sys.stdout` and `sys.stderr` are `Lasting`. One that was closed before the
+    process began takes everything, and its number does not go to the next file."""
+    _open_closed()
     before = sys.stdout, sys.stderr
-    sys.stdout, sys.stderr = lasting()  # type: ignore[assignment]
+    ours = tuple(map(_lasting, before, ("standard output", "standard error")))
+    sys.stdout, sys.stderr = ours
     try:
         yield
     finally:
-        sys.stdout, sys.stderr = before
+        for stream in ours:
+            stream.flush()  # what fails when Python flushes at exit costs the exit code
+        if (sys.stdout, sys.stderr) == ours:  # unless it overlaps with that of another thread
+            sys.stdout, sys.stderr = before
 
 
-def _lasting(file: IO[str] | None, name: str) -> Lasting:
+def _lasting(file: IO[str] | None, name: str) -> Any:
+    if file is None:
+        file = open(os.devnull, "w")  # noqa: SIM115
     return file if isinstance(file, Lasting) else Lasting(file, name)
+
+
+def _open_closed() -> None:
+    """Gives the numbers 0 to 2 to nothing, where they are free."""
+    while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
+        os.set_inheritable(number, True)
+    os.close(number)

@@ -48,9 +48,9 @@ def make_train_step(env: Environment, agent: Agent, config: Config) -> TrainStep
     carried over, so that their number is exactly
     `floor(collected steps * train_ratio / (batch_size * batch_length))`.
 
-    Metrics: counters `env_steps`, `updates` (so far), `chunk/updates`, `chunk/nonfinite` (what
-    arrived from environments), sums over finished episodes `episode/*`, `env/nonfinite`, and
-    means over this chunk's updates of the rest (NaN when there was none).
+    Metrics: counters `env_steps`, `updates` (so far), `chunk/updates`, `chunk/nonfinite` (of
+    what environments return, and of actions), sums over finished episodes `episode/*`,
+    `env/nonfinite`, and means over this chunk's updates of the rest (NaN when there was none).
     """
     collect = make_collect(env, agent, config)
     learn = make_learn(agent, config)

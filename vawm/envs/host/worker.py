@@ -319,7 +319,12 @@ def sendable(value: Any) -> Any:
 def main() -> None:
     """Serves the pool that started this process; its settings are the last argument."""
     settings = json.loads(sys.argv[-1])
-    sys.stdout, sys.stderr = streams.lasting()  # type: ignore[assignment]
+    with streams.outlive():
+        serve(settings)
+
+
+def serve(settings: dict[str, Any]) -> None:
+    """What the process does: it prepares, and answers until it is told to end."""
     for name in ("channel", "memory", "crash"):
         os.set_inheritable(settings[name], False)  # not for programs a simulator starts
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
