@@ -131,6 +131,7 @@ def test_what_was_put_aside_in_part_may_still_start_over(tmp_path, monkeypatch):
         patch.setattr(pathlib.Path, "rename", killed)
         with pytest.raises(KeyboardInterrupt):
             rundir.put_aside(tmp_path)
+    assert renamed == ["checkpoints", "config.json"]
     rundir.check_fresh(tmp_path)
     rundir.put_aside(tmp_path)
     (tmp_path / "config.json.tmp").touch()

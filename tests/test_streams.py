@@ -139,6 +139,30 @@ def test_what_was_closed_since_takes_everything(capsys):
     assert capsys.readouterr().err == told
 
 
+def test_a_pipe_that_stays_full_does_not_cost_the_exit_code():
+    script = """
+import os, sys
+from vawm import streams
+os.set_blocking(1, False)
+with streams.outlive():
+    for _ in range(2000):
+        print("x" * 99)
+sys.exit(3)
+"""
+    with subprocess.Popen(
+        [sys.executable, "-c", script], stdout=subprocess.PIPE, env=BUFFERED
+    ) as process:
+        assert process.wait(timeout=60) == 3  # and nobody has read
+
+
+def test_a_stream_that_was_replaced_inside_stays(monkeypatch):
+    monkeypatch.setattr(sys, "stdout", sys.stdout)
+    before, other = sys.stderr, io.StringIO()
+    with streams.outlive():
+        sys.stdout = other
+    assert (sys.stdout, sys.stderr) == (other, before)
+
+
 def test_what_it_cannot_encode_is_still_an_error():
     out = streams.Lasting(io.TextIOWrapper(io.BytesIO(), "ascii"), "standard output")
     with pytest.raises(UnicodeEncodeError):

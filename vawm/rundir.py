@@ -65,7 +65,8 @@ def check_fresh(logdir: pathlib.Path) -> None:
     ours = rf"{LOCK}|{re.escape(CONFIG)}\.tmp|{REPLACED}\d+"
     others = [name for name in names if not re.fullmatch(ours, name)]
     saved = any(logdir.glob(f"checkpoints/{'[0-9]' * 12}"))
-    if others and not saved and _content(logdir / CONFIG) is None:
+    begun = [logdir / CONFIG, *logdir.glob(f"{REPLACED}*/{CONFIG}")]  # or put aside in part
+    if others and not saved and not any(map(_content, begun)):
         remedy = "holds files, but no run to start over; choose another --logdir"
         raise InvalidInput("logdir", str(logdir), remedy)
 
@@ -158,8 +159,8 @@ def _content(path: pathlib.Path) -> dict[str, Any] | None:
 def put_aside(logdir: pathlib.Path) -> pathlib.Path | None:
     """Moves all that is in the folder into a new `replaced-<number>` in it; None if nothing.
 
-    What earlier calls have put aside stays where it is. `config.json`, by which `check_fresh`
-    knows a run, goes last.
+    What earlier calls have put aside stays where it is. `config.json` and the checkpoints go
+    first: what is left if this is interrupted is no run that could be resumed.
 
     Raises:
       OSError: something cannot be moved.
@@ -172,7 +173,7 @@ def put_aside(logdir: pathlib.Path) -> pathlib.Path | None:
     while (aside := logdir / f"{REPLACED}{number}").exists():
         number += 1
     aside.mkdir()
-    for path in sorted(found, key=lambda path: path.name == CONFIG):
+    for path in sorted(found, key=lambda path: path.name not in (CONFIG, "checkpoints")):
         path.rename(aside / path.name)
     return aside
 

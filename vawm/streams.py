@@ -64,6 +64,17 @@ class Lasting:
         with contextlib.suppress(OSError, ValueError):
             print(f"warning: {self._name} is gone ({why})", file=sys.stderr, flush=True)
 
+    def finish(self) -> None:
+        """Flushes, or loses what cannot be: Python's own flush at exit would cost the code."""
+        if not self._gone:
+            try:
+                self._file.flush()
+            except (OSError, ValueError) as error:
+                self._lose(error)
+
+    def isatty(self) -> bool:
+        return not self._gone and self._file.isatty()
+
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_"):  # while it is being copied it has none of its own
             raise AttributeError(name)
@@ -81,10 +92,13 @@ def outlive() -> Iterator[None]:
     try:
         yield
     finally:
+        # Unless someone put another one in its place: inside, or in another thread.
+        if sys.stdout is ours[0]:
+            sys.stdout = before[0]
+        if sys.stderr is ours[1]:
+            sys.stderr = before[1]
         for stream in ours:
-            stream.flush()  # what fails when Python flushes at exit costs the exit code
-        if (sys.stdout, sys.stderr) == ours:  # unless it overlaps with that of another thread
-            sys.stdout, sys.stderr = before
+            stream.finish()
 
 
 def _lasting(file: IO[str] | None, name: str) -> Any:
