@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import pathlib
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -13,6 +13,9 @@ from vawm.analysis.curves import aligned
 from vawm.analysis.figures import panels
 from vawm.sweep.results import Rows, missing, of_run
 from vawm.sweep.runs import Run, Sweep
+
+OF_MANY_SIZES = ("weight",)
+"""Columns whose axis is linear up to 1 and logarithmic from there on."""
 
 
 def plot(
@@ -54,11 +57,18 @@ def plot(
                 draw(ax, curves, quantity, f"C{color}", label.format(variant.name))
             named = quantity.replace("_", " ")
             ax.set(title=task, xlabel="thousand environment steps", ylabel=named)
+            if quantity in OF_MANY_SIZES:
+                ax.set_yscale("symlog", linthresh=1)
             if seeds == "band":
-                ax.legend()
+                ax.legend(**_place(len(sweep.variants)))
             if quantity == "return" and returns is not None:
                 ax.set_ylim(*returns)
-        axes[0, 0].legend()
+        axes[0, 0].legend(**_place(len(sweep.variants)))
+
+
+def _place(lines: int) -> dict[str, Any]:
+    """Where a legend of so many lines goes: beside the panel if it would hide the curves."""
+    return {"loc": "upper left", "bbox_to_anchor": (1, 1)} if lines > 4 else {}
 
 
 def _lines(panel, curves: Sequence[Rows], quantity: str, color: str, label: str) -> None:
