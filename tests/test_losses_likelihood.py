@@ -228,6 +228,20 @@ def test_image_mse_by_hand():
     np.testing.assert_allclose(losses.image_mse(prediction, target), [1.04], rtol=1e-6)
 
 
+def test_the_two_mean_squares_stop_nothing():
+    target, prediction = jnp.array([[1 - np.e**2, np.e - 1]]), jnp.array([[1.0, 3.0]])
+    to_prediction, to_target = jax.grad(lambda *x: losses.symlog_mse(*x).sum(), argnums=(0, 1))(
+        prediction, target
+    )
+    np.testing.assert_allclose(to_prediction, [[6.0, 4.0]], rtol=1e-6)
+    # d symlog(x) / dx is 1 / (1 + |x|).
+    np.testing.assert_allclose(to_target, [[-6.0 / np.e**2, -4.0 / np.e]], rtol=1e-5)
+    pixel = jnp.array([0.25]).reshape(1, 1, 1, 1)
+    byte = jnp.array([255], jnp.uint8).reshape(1, 1, 1, 1)
+    gradient = jax.grad(lambda x: losses.image_mse(x, byte).sum())(pixel)
+    np.testing.assert_allclose(gradient.ravel(), [-1.5], rtol=1e-6)
+
+
 @pytest.mark.parametrize("logit", [-100.0, -1.0, 0.0, 3.0, 100.0])
 @pytest.mark.parametrize("target", [0.0, 0.997, 1.0])
 def test_continue_loss_is_soft_cross_entropy(logit, target):

@@ -141,6 +141,19 @@ def test_vaml_by_hand():
     np.testing.assert_array_equal(to_target, np.zeros((2, 2)))
 
 
+def test_the_mean_of_the_worst_is_no_less_than_the_worst_mean():
+    prediction, target = values((5, 1))
+    worst = losses.vaml_loss(prediction, target).mean()
+    means = jax.vmap(losses.iter_vaml_loss)(prediction, target).mean((1, 2))
+    assert means.max() < worst
+
+
+def test_critics_that_tie_share_the_gradient():
+    prediction, target = jnp.array([[[3.0]], [[-1.0]]]), jnp.array([[1.0], [1.0]])
+    gradient = jax.grad(lambda x: losses.vaml_loss(x, target).sum())(prediction)
+    np.testing.assert_allclose(gradient, [[[2.0]], [[-2.0]]])  # half of 4 and of -4
+
+
 def test_vaml_refuses_critics_without_targets():
     with pytest.raises(AssertionError):
         losses.vaml_loss(jnp.zeros((5, 2, 3)), jnp.zeros((4, 3)))

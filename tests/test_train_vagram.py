@@ -1,16 +1,37 @@
 """The deterministic world model in the same training step: probabilities in replay."""
 
+import dataclasses
+
 import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+import runs
 import tiny
+import tiny_pixels
 import tiny_vagram
 
-from vawm import train
+from vawm import policy, runner, train
 from vawm.agent import make_agent
 
 CONFIG = tiny_vagram.CONFIG
+
+
+def test_a_run_from_pixels_on_the_host(tmp_path):
+    config = dataclasses.replace(
+        tiny_pixels.CONFIG,
+        agent="vagram",
+        world_model=dataclasses.replace(CONFIG.world_model, depth=1),
+        value_alignment=CONFIG.value_alignment,
+    )
+    runner.run(config, tmp_path, env=tiny_pixels.pool(), console=runs.quiet())
+    *_, last = runs.lines(tmp_path)
+    assert (last["env_steps"], last["updates"]) == (config.env_steps, 18)
+    assert all(np.isfinite(x) for name, x in last.items() if name.startswith("loss/"))
+    assert last["loss/value_gradient"] > 0
+    assert last["loss/dynamics"] == last["loss/value_alignment"] == 0.0
+    loaded = policy.load(tmp_path)
+    assert loaded.config.agent == "vagram"
 
 
 def test_it_learns_and_replay_remembers_probabilities():
