@@ -81,10 +81,24 @@ def list_notebooks() -> str:
     """The page that links to the notebooks, by their first lines."""
     lines = ["# Notebooks\n", "They run on a CPU; the extra `notebooks` has what they need.\n"]
     for path in sorted(NOTEBOOKS.glob("*.ipynb")):
-        first = json.loads(path.read_text())["cells"][0]["source"]
-        title = "".join(first).splitlines()[0].lstrip("# ")
-        lines.append(f"- [{title}](notebooks/{path.name})")
+        title = cells(path)[0][1].splitlines()[0].lstrip("# ")
+        lines.append(f"- [{title}](notebooks/{path.stem}.md)")
     return "\n".join(lines)
+
+
+def cells(path: pathlib.Path) -> list[tuple[str, str]]:
+    """Kind and text of every cell of a notebook."""
+    content = json.loads(path.read_text())["cells"]
+    return [(cell["cell_type"], "".join(cell["source"])) for cell in content]
+
+
+def notebook_page(path: pathlib.Path) -> str:
+    """A notebook to read: its text and code. Plots come when it is run."""
+    title, *rest = (
+        text if kind == "markdown" else f"```python\n{text}\n```" for kind, text in cells(path)
+    )
+    download = f"[Download it]({path.name}) to run it; its plots are made then."
+    return "\n\n".join([title, download, *rest]) + "\n"
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
@@ -95,13 +109,15 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
 
 
 def on_files(files: Files, *, config: MkDocsConfig) -> Files:
-    """Adds the pages, and the notebooks themselves."""
+    """Adds the pages, and the notebooks to read and to run."""
     from mkdocs.structure.files import File
 
     for path, module in pages().items():
         files.append(File.generated(config, path, content=f"::: {module}\n"))
     files.append(File.generated(config, "notebooks.md", content=list_notebooks()))
     for notebook in NOTEBOOKS.glob("*.ipynb"):
+        path = f"notebooks/{notebook.stem}.md"
+        files.append(File.generated(config, path, content=notebook_page(notebook)))
         path = f"notebooks/{notebook.name}"
         files.append(File.generated(config, path, abs_src_path=str(notebook)))
     return files

@@ -339,3 +339,14 @@ def test_no_docstring_has_words_that_html_would_swallow():
             text = "\n".join(line for line in lines if not line.startswith("    "))
             found = re.findall(r"<[a-zA-Z/][^\s>]*>", re.sub(r"`[^`]*`", "", text))
             assert not found, (path, node.lineno, found)
+
+
+def test_the_page_of_a_notebook_has_all_of_its_text_and_code():
+    for path in gen_reference.NOTEBOOKS.glob("*.ipynb"):
+        page = gen_reference.notebook_page(path)
+        assert page.startswith("# ")
+        assert f"({path.name})" in page
+        kinds = [kind for kind, _ in gen_reference.cells(path)]
+        assert page.count("```python\n") == kinds.count("code") > 3
+        assert all(text in page for _, text in gen_reference.cells(path))
+        assert f"notebooks/{path.stem}.md" in gen_reference.list_notebooks()
