@@ -29,7 +29,12 @@ from vawm.types import EnvSpec
 STEPS = 50  # of a config that does not come to its second update before
 
 PIXELS = {
-    suite: dataclasses.replace(tiny_pixels.CONFIG, suite=suite, env=kind(workers=1))
+    suite: tiny_pixels.config(
+        suite=suite,
+        env=kind(workers=1),
+        action_repeat=4 if suite == "atari100k" else 1,
+        env_steps=4 * tiny.CONFIG.env_steps,
+    )
     for suite, kind in config_lib.ENV_CONFIGS.items()
     if issubclass(kind, config_lib.HostEnvConfig)
 }
@@ -61,8 +66,11 @@ def value_of(kind: typing.Any) -> st.SearchStrategy:
 class Nothing:
     """In the place of `tiny_pixels.pool()`: what is known before any process is started."""
 
-    spec = EnvSpec("lamp", tiny_pixels.Lamp.obs, 2, True, tiny.CONFIG.num_envs, 1, 4)
     restarts = 0
+
+    def __init__(self, action_repeat):
+        obs, num_envs = tiny_pixels.Lamp.obs, tiny.CONFIG.num_envs
+        self.spec = EnvSpec("lamp", obs, 2, True, num_envs, action_repeat, 4)
 
     def close(self):
         pass
@@ -95,7 +103,8 @@ def refusal(config: Config, folder: pathlib.Path) -> str:
     """Why `config` is refused, in one line that begins with the name of a choice; or ""."""
     try:
         runner.check(config, folder, resume=False, known_task=False)
-        runner.prepare(config, tiny.env() if config.suite == "dmc_proprio" else Nothing())
+        on_device = config.suite == "dmc_proprio"
+        runner.prepare(config, tiny.env() if on_device else Nothing(config.action_repeat))
     except InvalidInput as error:
         if error.field not in NAMES or "\n" in str(error):
             raise AssertionError(f"not one line about a choice: {error}") from error

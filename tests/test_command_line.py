@@ -113,6 +113,7 @@ def test_a_run_gets_a_folder_of_its_own():
         (["--env-steps", "0"], "env_steps=0: use a number above 0"),
         (["--replay.capacity", "100"], "replay.capacity=100: use at least"),
         (["--resume"], "logdir=None: --resume needs the --logdir"),
+        (["--fresh"], "logdir=None: --fresh needs the --logdir"),
         (["--resume", "--logdir", "nowhere"], "logdir='nowhere': is not there"),
         (["--resume", "--logdir", "file"], "logdir='file': holds no checkpoint"),
         (["--logdir", "."], "logdir='.': exists"),

@@ -1,5 +1,6 @@
 """An exported policy: the same actions bit for bit, and a refusal for all that is not it."""
 
+import dataclasses
 import errno
 import json
 import os
@@ -149,9 +150,12 @@ def test_the_lines_that_are_promised_act_in_a_process_that_never_trained(
     )
 
 
-def test_the_card_of_an_environment_of_ones_own_says_so(exported):
-    card = (exported / "README.md").read_text()
-    assert "timestep)  # of your environment" in card
+@pytest.mark.parametrize("task", [tiny.CONFIG.task, "cartpole_swingup"])
+def test_the_card_of_an_environment_of_ones_own_says_so(exported, task):
+    """Whatever task its config has, such as that of a preset."""
+    loaded = vawm.load(exported)
+    config = dataclasses.replace(loaded.config, task=task)
+    assert "timestep)  # of your own" in export.card(loaded._replace(config=config), "")
 
 
 def test_a_policy_of_another_version_is_told_in_the_log(exported, monkeypatch, caplog):
@@ -362,9 +366,6 @@ def test_a_folder_of_a_run_is_not_taken_for_an_export(logdir, tmp_path):
 # The command line
 
 
-CONFIG_AND_KEY = tiny.CONFIG, jax.random.key(1)
-
-
 def test_the_command_line_evaluates_and_exports(logdir, tmp_path, monkeypatch, capsys):
     logdir = shutil.copytree(logdir, tmp_path / "run")
     asked = []
@@ -372,7 +373,8 @@ def test_the_command_line_evaluates_and_exports(logdir, tmp_path, monkeypatch, c
     def fake(policy, **kwargs):
         """Plays while the run goes on."""
         asked.append((policy.env_steps, kwargs))
-        newer = train.init(tiny.env(), make_agent(tiny.CONFIG, policy.spec), *CONFIG_AND_KEY)
+        agent, key = make_agent(tiny.CONFIG, policy.spec), jax.random.key(1)
+        newer = train.init(tiny.env(), agent, tiny.CONFIG, key)
         usual = {"config": tiny.CONFIG, "spec": policy.spec, "progress": {}}
         checkpoint.save(logdir, newer, env_steps=40, **usual)
         return Score((1.0, 3.0))

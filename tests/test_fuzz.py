@@ -17,6 +17,11 @@ def test_a_config_is_refused_by_the_name_of_a_choice_or_not_at_all(config):
     assert not NOWHERE.exists()
 
 
+@pytest.mark.parametrize("config", (fuzz.BASES | fuzz.PIXELS).values())
+def test_what_is_begun_with_is_not_refused(config):
+    assert not fuzz.refusal(config, NOWHERE)
+
+
 @hypothesis.given(fuzz.configs(fuzz.PIXELS))
 @hypothesis.settings(max_examples=120)
 def test_so_is_one_for_images_in_any_suite_on_the_host(config):

@@ -237,7 +237,7 @@ def test_starting_over_on_purpose_moves_what_is_there_aside(tmp_path, fake):
         assert measured(aside) == before
         assert checkpoint.find(aside).manifest.config.seed == number - 1
         assert checkpoint.find(tmp_path / "run").manifest.config.seed == number
-    with pytest.raises(InvalidInput, match="fresh=True: starts over; leave out --resume"):
+    with pytest.raises(InvalidInput, match="fresh=True: starts over, and --resume goes on"):
         run(tiny.CONFIG, tmp_path / "run", fresh=True, resume=True)
 
 
@@ -310,10 +310,12 @@ def test_a_loss_that_is_not_finite_is_told_though_a_save_has_failed(
 
 def test_what_replay_holds_that_is_not_finite_is_named_by_environment_and_step():
     nan, inf = math.nan, math.inf
-    assert diagnosis.nonfinite_replay(stored([[1.0, nan, 2.0], [-inf, 0.0, nan]])) == [
+    replay_of_both = stored([[1.0, nan, 2.0], [-inf, 0.0, nan]])
+    state = toy.state()._replace(replay=replay_of_both, collector=arrived())
+    assert diagnosis.nonfinite_steps(state) == [
         {"field": "reward", "environment": 1, "steps_ago": 2, "steps": 3}
     ]
-    assert not diagnosis.nonfinite_replay(stored([[1e30], [-1e30]]))
+    assert not diagnosis.nonfinite_steps(state._replace(replay=stored([[1e30], [-1e30]])))
 
 
 def test_what_has_arrived_and_is_not_stored_yet_comes_after_what_is():
@@ -415,16 +417,16 @@ def breaking(field, at):
     return plain._replace(reset=reset, step=step)
 
 
-@pytest.mark.parametrize("field", ["reward", "obs"])
-def test_one_step_that_is_not_finite_stops_the_run_before_it_is_saved(tmp_path, field):
+@pytest.mark.parametrize(("field", "ago"), [("reward", 2), ("obs", 2), ("obs", 0)])
+def test_one_step_that_is_not_finite_stops_the_run_before_it_is_saved(tmp_path, field, ago):
     """Of an environment of one's own on the device. Mended, the run goes on."""
     told = (
         "what an environment returned is not finite at env_steps=40; kept: the checkpoint at "
-        rf"32; .*json. environment 1 returned {field} that is not finite, 2 steps before the "
-        "newest: mend what returned it, then go on with --resume"
+        rf"32; .*json. environment 1 returned {field} that is not finite, {ago} steps before "
+        "the newest: mend what returned it, then go on with --resume"
     )
-    with pytest.raises(RunError, match=told):  # call 22 of the 24 of six chunks
-        run(tiny.CONFIG, tmp_path, env=breaking(field, at=22))
+    with pytest.raises(RunError, match=told):  # after the 24 calls of six chunks
+        run(tiny.CONFIG, tmp_path, env=breaking(field, at=24 - ago))
     diagnosed = json.loads((tmp_path / "diagnosis.json").read_text())
     assert diagnosed["nonfinite_replay"][0]["field"] == field  # the action that followed, too
     assert not diagnosed["nonfinite_parameters"]

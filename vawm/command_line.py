@@ -99,6 +99,8 @@ def parse(
     argv = [_without_alias(word, aliases or {}) for word in argv]
     default = Flags(_defaults(argv, suite, preset))
     flags = flags_lib.read(Flags, argv, default=default, description=description)
+    if flags.fresh and flags.logdir is None:
+        raise InvalidInput("logdir", None, "--fresh needs the --logdir to start over in")
     config = _with_its_size(flags.config)
     if config.suite != suite:
         remedy = f"this program runs suite {suite}; use the one of that suite"

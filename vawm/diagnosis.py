@@ -6,7 +6,7 @@ import dataclasses
 import json
 import math
 import pathlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import jax
@@ -14,12 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from vawm import checkpoint, tracking
-from vawm.collector import is_finite
 from vawm.config import Config
-from vawm.replay import Replay
 from vawm.tracking import METRICS, Line
 from vawm.train import TrainState
-from vawm.types import Array
+from vawm.types import Array, PyTree
 
 FILE = "diagnosis.json"
 
@@ -99,44 +97,37 @@ def last_finite_line(logdir: pathlib.Path) -> Line | None:
 
 
 def nonfinite_steps(state: TrainState) -> list[dict[str, Any]]:
-    """`nonfinite_replay`, and what arrived after the newest of its steps: -1 steps ago."""
-    found = nonfinite_replay(state.replay)
-    for name, leaf in checkpoint.flatten(state.collector.timestep).items():
-        if not jnp.issubdtype(leaf.dtype, jnp.floating):
-            continue
-        envs = np.flatnonzero(~np.asarray(is_finite(leaf)))
-        if len(envs):
-            field = {"field": name.lstrip("."), "environment": int(envs[0])}
-            found.append(field | {"steps_ago": -1, "steps": len(envs)})
-    return found
-
-
-def nonfinite_replay(replay: Replay) -> list[dict[str, Any]]:
     """Per field of the trajectory where it is not finite: in which environment first, how many
     steps of that environment ago, and in how many steps of all.
 
-    Counted back from the newest step, which is 0 steps ago. One reduction to `[N, C]` each.
+    Counted back from the newest step in replay, which is 0 steps ago; what has arrived since
+    and waits to be stored is -1 steps ago. One reduction to `[N, C]` each.
     """
+    replay = state.replay
     capacity = replay.trajectory.reward.shape[1]
-    newest = int(replay.head) - 1
-    found = []
-    for name, leaf in checkpoint.flatten(replay.trajectory).items():
+    ago = (int(replay.head) - 1 - np.arange(capacity)) % capacity
+    waiting = jax.tree.map(lambda x: x[:, None], state.collector.timestep)
+    return [
+        *_nonfinite(replay.trajectory, ago),
+        *_nonfinite(waiting, np.array([-1])),
+    ]
+
+
+def _nonfinite(steps: PyTree, ago: np.ndarray) -> Iterator[dict[str, Any]]:
+    """An entry for every field of `steps`, `[N, C, ...]`, of which `ago` is the age, `[C]`."""
+    for name, leaf in checkpoint.flatten(steps).items():
         if not jnp.issubdtype(leaf.dtype, jnp.floating) or not leaf.size:
             continue
         envs, slots = np.nonzero(~np.asarray(_finite_steps(leaf)))
         if not len(envs):
             continue
-        ago = (newest - slots) % capacity
-        oldest = int(np.argmax(ago))
-        found.append(
-            {
-                "field": name.lstrip("."),
-                "environment": int(envs[oldest]),
-                "steps_ago": int(ago[oldest]),
-                "steps": len(envs),
-            }
-        )
-    return found
+        oldest = int(np.argmax(ago[slots]))
+        yield {
+            "field": name.lstrip("."),
+            "environment": int(envs[oldest]),
+            "steps_ago": int(ago[slots[oldest]]),
+            "steps": len(envs),
+        }
 
 
 def advice(state: TrainState) -> str:

@@ -40,28 +40,22 @@ PROTOCOLS = {
 """Suite -> what `vawm.evaluate` plays, for the model card."""
 
 
-USAGE = """\
+LOAD = """\
 import jax, vawm
 
 policy = vawm.load("FOLDER")  # this one
+"""
+USAGE = f"""{LOAD}\
 env = vawm.envs.make(policy.spec.task, num_envs=1, action_repeat=policy.spec.action_repeat)
 _, timestep = env.reset(jax.random.key(0))
 carry, action = policy.act(jax.random.key(1), policy.initial(1), timestep)"""
-OWN_USAGE = """\
-import jax, vawm
-
-policy = vawm.load("FOLDER")  # this one
-carry = policy.initial(1)
-carry, action = policy.act(jax.random.key(1), carry, timestep)  # of your environment"""
-HOST_USAGE = """\
-import jax, vawm
-from vawm import suites
-
-policy = vawm.load("FOLDER")  # this one
-with suites.make(policy.config) as env:  # as in training, in processes of its own
-    timestep = env.reset(0)
-    carry = policy.initial(env.spec.num_envs)
+HOST_USAGE = f"""{LOAD}\
+with vawm.suites.make(policy.config) as env:  # as in training, in processes of its own
+    carry, timestep = policy.initial(env.spec.num_envs), env.reset(0)
     carry, action = policy.act(jax.random.key(1), carry, timestep)"""
+OWN_USAGE = f"""{LOAD}\
+carry, action = policy.act(jax.random.key(1), policy.initial(1), timestep)  # of your own"""
+"""How to act once, for the model card: on MJX, on the host, in an environment of one's own."""
 
 
 def export(
@@ -175,11 +169,9 @@ Apache-2.0, as vawm itself.
 def _usage(policy: Policy) -> str:
     """The lines that load the policy and act once."""
     config = policy.config
-    try:
-        suites.check_task(config)
+    try:  # not the task of the config, which says nothing of an environment of one's own
+        suites.check_task(dataclasses.replace(config, task=policy.spec.task))
     except InvalidInput:
-        return OWN_USAGE
-    if policy.spec.task != config.task:
         return OWN_USAGE
     return HOST_USAGE if isinstance(config.env, HostEnvConfig) else USAGE
 

@@ -18,8 +18,9 @@ from vawm import manifest as manifest_lib
 from vawm.config import Config
 from vawm.errors import InvalidInput
 
-HELD = (errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES)
+HELD = (errno.EAGAIN, errno.EACCES)
 NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.EINVAL)
+"""What a lock fails with where another has it, and where the file system has none."""
 LOCK, CONFIG, REPLACED = "lock", "config.json", "replaced-"
 
 
@@ -160,7 +161,7 @@ def put_aside(logdir: pathlib.Path) -> pathlib.Path | None:
     """Moves all that is in the folder into a new `replaced-<number>` in it; None if nothing.
 
     What earlier calls have put aside stays where it is. `config.json` and the checkpoints go
-    first: what is left if this is interrupted is no run that could be resumed.
+    first: what is left if this is interrupted is no run that would be resumed.
 
     Raises:
       OSError: something cannot be moved.

@@ -135,14 +135,14 @@ def run(
                 say(f"no checkpoint in {logdir} yet: this run starts from the beginning")
             rundir.write_config(logdir, config)
             state, progress = program.init(config.seed), Progress()
-        _refuse_nonfinite(state)
+            _refuse_nonfinite(state)
         result = _loop(config, logdir, program, state, progress, console)
     _summarise(config, result, say, command, known_task=env is None)
     return result
 
 
 def _refuse_nonfinite(state: PyTree) -> None:
-    """Refuses first observations that are not finite; of later steps none is ever saved."""
+    """Refuses first observations that are not finite, which no chunk has counted."""
     if found := diagnosis.nonfinite_steps(state):
         raise RunError(f"{diagnosis.where(found[0])} where the run begins: mend that")
 
@@ -166,7 +166,7 @@ def check(
     if not resume:  # a run that was begun goes on without its tracker
         backends.check(config)
     if resume and fresh:
-        raise InvalidInput("fresh", True, "starts over; leave out --resume, or this")
+        raise InvalidInput("fresh", True, "starts over, and --resume goes on; leave one out")
     if resume:
         resume_lib.check(logdir, config)
         for folder in (logdir, checkpoint.root(logdir)):
@@ -284,7 +284,7 @@ def _loop(
         ) as saver,
     ):
         tracker.show_videos(after=progress.logged)
-        display.note("compiling (takes a minute the first time, seconds from then on) ...")
+        display.note("compiling (a minute for new settings, seconds for those of before) ...")
         step = program.compile(state).run
         last = progress.env_steps >= config.env_steps or stop.signal is not None
         while not last:

@@ -10,7 +10,7 @@ import contextlib
 import os
 import sys
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import IO, Any
 
 
@@ -26,15 +26,7 @@ class Lasting:
         self._gone, self._lock = False, threading.Lock()
 
     def write(self, text: str) -> int:
-        if not self._gone:
-            try:
-                self._file.write(text)
-            except UnicodeError:
-                raise
-            except BlockingIOError:  # a pipe that is full for the moment: this text is lost
-                pass
-            except (OSError, ValueError) as error:  # ValueError: it was closed
-                self._lose(error)
+        self._try(self._file.write, text)
         return len(text)
 
     def writelines(self, lines: Iterable[str]) -> None:
@@ -42,12 +34,22 @@ class Lasting:
             self.write(line)
 
     def flush(self) -> None:
-        if not self._gone:
-            try:
-                self._file.flush()
-            except BlockingIOError:
-                pass
-            except (OSError, ValueError) as error:
+        self._try(self._file.flush)
+
+    def finish(self) -> None:
+        """Flushes, or loses what cannot be: Python's own flush at exit would cost the code."""
+        self._try(self._file.flush, last=True)
+
+    def _try(self, call: Callable[..., object], *arguments: str, last: bool = False) -> None:
+        if self._gone:
+            return
+        try:
+            call(*arguments)
+        except UnicodeError:
+            raise
+        except (OSError, ValueError) as error:  # ValueError: it was closed
+            # A pipe that is full for the moment has lost this text alone.
+            if last or not isinstance(error, BlockingIOError):
                 self._lose(error)
 
     def _lose(self, error: OSError | ValueError) -> None:
@@ -63,14 +65,6 @@ class Lasting:
         why = error.strerror if isinstance(error, OSError) else error
         with contextlib.suppress(OSError, ValueError):
             print(f"warning: {self._name} is gone ({why})", file=sys.stderr, flush=True)
-
-    def finish(self) -> None:
-        """Flushes, or loses what cannot be: Python's own flush at exit would cost the code."""
-        if not self._gone:
-            try:
-                self._file.flush()
-            except (OSError, ValueError) as error:
-                self._lose(error)
 
     def isatty(self) -> bool:
         return not self._gone and self._file.isatty()

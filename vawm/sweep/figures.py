@@ -59,11 +59,10 @@ def plot(
             ax.set(title=task, xlabel="thousand environment steps", ylabel=named)
             if quantity in OF_MANY_SIZES:
                 ax.set_yscale("symlog", linthresh=1)
-            if seeds == "band":
+            if seeds == "band" or ax is axes[0, 0]:
                 ax.legend(**_place(len(sweep.variants)))
             if quantity == "return" and returns is not None:
                 ax.set_ylim(*returns)
-        axes[0, 0].legend(**_place(len(sweep.variants)))
 
 
 def _place(lines: int) -> dict[str, Any]:
