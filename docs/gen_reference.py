@@ -18,17 +18,14 @@ PACKAGE = ROOT / "vawm"
 NOTEBOOKS = ROOT / "notebooks"
 
 ORDER = {
-    "Losses and what they are made of": ("losses", "returns", "transforms", "distributions"),
+    "Losses": ("losses", "distributions"),
     "Data and choices": ("types", "config", "presets", "errors"),
-    "World models": ("world_model", "imagination", "nets"),
-    "Actor and critic": ("actor_critic", "agent"),
-    "Losses of an agent": ("objective", "value_gradient"),
-    "Learning": ("learner", "learn", "optim", "replay", "image_store"),
-    "Training": ("train", "host_train", "collector", "suites"),
+    "World models and agents": ("world_model", "agent", "nets"),
     "Environments": ("envs",),
-    "Runs": ("runner", "checkpoint", "resume", "rundir", "tracking", "validate"),
-    "Evaluation": ("policy", "evaluate", "play", "scores", "export"),
-    "Comparison": ("analysis", "sweep", "overhead"),
+    "Learning": ("learning",),
+    "Runs": ("runs", "process", "cli"),
+    "Evaluation": ("policy", "evaluate", "export"),
+    "Comparison": ("analysis", "sweep"),
 }
 """Title -> rooms of the package, which are modules or folders, in the order of reading."""
 

@@ -26,8 +26,7 @@ from typing import Any, Literal, NamedTuple
 
 import jax
 
-from vawm import cache, command_line, evaluate, flags, huge_pages, rundir
-from vawm import policy as policy_lib
+from vawm import evaluate
 from vawm.analysis import (
     curves,
     episodes,
@@ -40,10 +39,14 @@ from vawm.analysis import (
     values,
 )
 from vawm.analysis.episodes import Episodes
+from vawm.cli import command_line, flags
 from vawm.config import Config
 from vawm.envs.protocol import check_positive
 from vawm.errors import InvalidInput
 from vawm.policy import Policy
+from vawm.policy import policy as policy_lib
+from vawm.process import cache, huge_pages
+from vawm.runs import run_folder
 from vawm.types import is_image
 
 FRAMES_PER_SECOND = 5  # slow enough to compare
@@ -125,7 +128,7 @@ def prepare(options: Options) -> Loaded:
     if not options.logdirs:
         raise InvalidInput("logdirs", (), "name the folder of at least one run")
     called = dict(zip(names(options.logdirs), options.logdirs, strict=True))
-    rundir.check_writable(options.output, "output")
+    run_folder.check_writable(options.output, "output")
     figures.check()
     plays = options.what != "curves"
     loaded = Loaded(

@@ -28,10 +28,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vawm import envs, flags, huge_pages, learn, memory, suites, train, validate
+from vawm import envs
 from vawm.agent import make_agent, parameter_count
-from vawm.collector import make_collect
-from vawm.command_line import guard
+from vawm.cli import flags
+from vawm.cli.command_line import guard
 from vawm.config import (
     SIZES,
     Config,
@@ -42,10 +42,14 @@ from vawm.config import (
 )
 from vawm.envs.protocol import check_positive
 from vawm.errors import InvalidInput
-from vawm.learn import Draw
-from vawm.learner import init_learner, make_update
-from vawm.overhead import peak_process_bytes, percent_more, quartiles
+from vawm.learning import from_replay, train
+from vawm.learning.collector import make_collect
+from vawm.learning.from_replay import Draw
+from vawm.learning.update import init_learner, make_update
 from vawm.presets import PAPER, STORM, vagram
+from vawm.process import huge_pages
+from vawm.runs import budget, suites, validate
+from vawm.sweep.overhead import peak_process_bytes, percent_more, quartiles
 from vawm.types import Batch, EnvSpec, Trajectory, image, vector
 from vawm.world_model.codecs import check_image_size
 
@@ -231,14 +235,14 @@ def check_memory(agent, config: Config) -> None:
     """Refuses what does not fit: two learners, and the larger part of one update."""
     init = functools.partial(init_learner, agent, config)
     learner = jax.eval_shape(init, jax.random.key(0))
-    state, params = memory.nbytes(learner), memory.nbytes(learner.params)
+    state, params = budget.nbytes(learner), budget.nbytes(learner.params)
     needed = (
-        2 * (state + params) + memory.working_bytes(agent.spec, config) + memory.process_bytes()
+        2 * (state + params) + budget.working_bytes(agent.spec, config) + budget.process_bytes()
     )
-    available = memory.available_bytes()
+    available = budget.available_bytes()
     if available is not None and needed > available:
         remedy = (
-            f"needs {memory.readable(needed)}, {memory.readable(available)} are free; "
+            f"needs {budget.readable(needed)}, {budget.readable(available)} are free; "
             "use a smaller size or batch"
         )
         raise InvalidInput("size", config.size, remedy)
@@ -248,7 +252,7 @@ def run(options: Benchmark) -> dict:
     config = make_config(options)
     agent = make_agent(config, make_spec(options))
     check_memory(agent, config)
-    shapes = learn.shapes(config)
+    shapes = from_replay.shapes(config)
     remembered = agent.world_model.initial(options.batch_size)
     context = agent.world_model.memory(remembered)
     batch = Draw(

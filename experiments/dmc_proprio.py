@@ -13,7 +13,8 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from vawm import command_line, huge_pages
+from vawm.cli import command_line
+from vawm.process import huge_pages
 
 
 def main(argv: Sequence[str] | None = None) -> int:

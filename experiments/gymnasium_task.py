@@ -3,9 +3,9 @@
     python experiments/gymnasium_task.py --task CartPole-v1
 
 The environment is checked first; all that does not fit is told at once. One that is not
-registered is trained by `vawm.runner.run(config, logdir, env=vawm.envs.from_gymnasium(...))`.
-Every field of `vawm.config.Config` is a flag, those of `GymnasiumConfig` as `--env.*`;
-`--help` lists them.
+registered is trained by
+`vawm.runs.runner.run(config, logdir, env=vawm.envs.from_gymnasium(...))`. Every field of
+`vawm.config.Config` is a flag, those of `GymnasiumConfig` as `--env.*`; `--help` lists them.
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from vawm import command_line, huge_pages
+from vawm.cli import command_line
+from vawm.process import huge_pages
 
 
 def main(argv: Sequence[str] | None = None) -> int:

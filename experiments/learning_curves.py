@@ -19,9 +19,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
-from vawm import command_line, flags, validate
 from vawm.analysis.tables import write_csv
+from vawm.cli import command_line, flags
 from vawm.config import ValueAlignmentConfig
+from vawm.runs import validate
 from vawm.sweep import children, figures, results, runs
 from vawm.sweep.runs import PROGRAMS, Sweep, Variant
 

@@ -8,8 +8,8 @@ import hypothesis
 import jax
 import pytest
 
-from vawm import cache
 from vawm.envs.host import rendering
+from vawm.process import cache
 
 os.environ.setdefault("MUJOCO_GL", "disable")  # dm_control is asked for physics only
 hurry.hurry()

@@ -16,10 +16,12 @@ import pytest
 import scipy.special
 import tiny
 
-from vawm import command_line, envs, flags, presets, runner, suites, validate
-from vawm import policy as policy_lib
+from vawm import envs, presets
 from vawm.agent import make_agent
+from vawm.cli import command_line, flags
 from vawm.envs import probes
+from vawm.policy import policy as policy_lib
+from vawm.runs import runner, suites, validate
 
 ROOT = pathlib.Path(__file__).parents[1]
 DOCS, README = ROOT / "docs", ROOT / "README.md"

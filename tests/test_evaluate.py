@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 import tiny
 
-from vawm import checkpoint, evaluate, play, policy, train
+from vawm import evaluate
 from vawm.agent import make_agent
 from vawm.envs import probes
 from vawm.errors import InvalidInput
-from vawm.play import Score
-from vawm.policy import Policy
+from vawm.learning import train
+from vawm.policy import Policy, play, policy
+from vawm.policy.play import Score
+from vawm.runs import checkpoint
 from vawm.types import EnvSpec, vector
 
 CARTPOLE = EnvSpec("cartpole_balance", vector(5), 1, False, 2, 5, 200)

@@ -19,13 +19,16 @@ import tiny
 import toy
 
 import vawm
-from vawm import checkpoint, evaluate, export, manifest, policy, suites, train, weights
 from vawm import config as config_lib
+from vawm import evaluate, export
 from vawm.agent import make_agent
-from vawm.checkpoint import SaveError
 from vawm.envs.protocol import Environment
 from vawm.errors import InvalidInput
-from vawm.play import Score
+from vawm.learning import train
+from vawm.policy import policy, weights
+from vawm.policy.play import Score
+from vawm.runs import checkpoint, suites
+from vawm.runs.checkpoint import SaveError, manifest
 
 STEPS = 3
 

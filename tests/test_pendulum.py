@@ -10,8 +10,9 @@ import runs
 import tiny
 from gymnasium.envs.classic_control import CartPoleEnv
 
-from vawm import checkpoint, envs, evaluate, presets, runner
 from vawm import config as config_lib
+from vawm import envs, evaluate, presets
+from vawm.runs import checkpoint, runner
 
 CONFIG = tiny.config(
     task="pendulum_swingup", action_repeat=20, env_steps=3000, log_every=320, save_every=960

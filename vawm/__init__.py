@@ -1,14 +1,12 @@
 """Value-aligned world models in JAX.
 
-    vawm.losses         the losses as a functional library
-    vawm.returns, vawm.transforms, vawm.distributions   what they are made of
-    vawm.envs           18 tasks of the DeepMind Control Suite on MJX, and probes
-    vawm.envs.host      Atari, DMC vision and Gymnasium, stepped in processes of their own
-    vawm.world_model, vawm.actor_critic, vawm.agent     the agent as pure functions
-    vawm.objective, vawm.learner, vawm.learn            its loss, one update, those due
-    vawm.train, vawm.host_train         the step around MJX, and around host environments
-    vawm.runner, vawm.checkpoint        runs on disk
-    vawm.evaluate, vawm.scores          protocols of the suites, and published scores
+    vawm.losses         the losses as a functional library, and what they are made of
+    vawm.types, vawm.config, vawm.presets   the data, the choices, the paper's and small ones
+    vawm.world_model, vawm.agent            world models; what imagines and acts in them
+    vawm.envs           the DeepMind Control Suite on MJX and rendered, Gymnasium, Atari
+    vawm.learning       the objective, one update, replay, the jitted training step
+    vawm.runs           the loop of a run on disk, checkpoints, reports
+    vawm.policy         trained policies, and published scores
     vawm.analysis       what value alignment does, in numbers and pictures
     vawm.sweep          many runs of one program, tables and curves of them
     vawm.load           a policy from a run's checkpoint, or as vawm.export wrote it

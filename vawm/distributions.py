@@ -10,7 +10,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from vawm.transforms import unimix_logits
+from vawm.losses.transforms import unimix_logits
 
 with warnings.catch_warnings():
     warnings.filterwarnings("ignore", category=DeprecationWarning)

@@ -23,14 +23,17 @@ from typing import Any, Literal
 
 import jax
 
-from vawm import cache, envs, flags, huge_pages, play, scores, suites
-from vawm import policy as policy_lib
-from vawm.command_line import guard
+from vawm import envs
+from vawm.cli import flags
+from vawm.cli.command_line import guard
 from vawm.config import HostEnvConfig
 from vawm.envs.protocol import Environment, HostEnvironment, check_positive
 from vawm.errors import InvalidInput
-from vawm.play import How, Score
-from vawm.policy import Policy
+from vawm.policy import Policy, play, scores
+from vawm.policy import policy as policy_lib
+from vawm.policy.play import How, Score
+from vawm.process import cache, huge_pages
+from vawm.runs import suites
 
 AT_ONCE = 8
 """Environments on the host that are stepped together, each with its share of the episodes."""

@@ -10,7 +10,8 @@ Five lines load it and act, wherever vawm is installed; no run and no checkpoint
     _, timestep = env.reset(jax.random.key(0))
     carry, action = policy.act(jax.random.key(1), policy.initial(1), timestep)
 
-`python -m vawm.evaluate --logdir cartpole` evaluates it. The files are those of `vawm.weights`.
+`python -m vawm.evaluate --logdir cartpole` evaluates it. The files are those of
+`vawm.policy.weights`.
 """
 
 from __future__ import annotations
@@ -21,15 +22,19 @@ import pathlib
 import sys
 from collections.abc import Sequence
 
-from vawm import cache, evaluate, flags, huge_pages, suites, tracking, weights
-from vawm import manifest as manifest_lib
-from vawm import policy as policy_lib
+from vawm import evaluate
 from vawm.agent import parameter_count
-from vawm.command_line import guard
+from vawm.cli import flags
+from vawm.cli.command_line import guard
 from vawm.config import Config, HostEnvConfig
 from vawm.errors import InvalidInput
-from vawm.play import Score
-from vawm.policy import Policy
+from vawm.policy import Policy, weights
+from vawm.policy import policy as policy_lib
+from vawm.policy.play import Score
+from vawm.process import cache, huge_pages
+from vawm.runs import suites
+from vawm.runs.checkpoint import manifest as manifest_lib
+from vawm.runs.reports import tracking
 
 PROTOCOLS = {
     "dmc_proprio": "whole episodes of 1000 control steps, simulated on MJX as in training",
@@ -50,7 +55,7 @@ env = vawm.envs.make(policy.spec.task, num_envs=1, action_repeat=policy.spec.act
 _, timestep = env.reset(jax.random.key(0))
 carry, action = policy.act(jax.random.key(1), policy.initial(1), timestep)"""
 HOST_USAGE = f"""{LOAD}\
-with vawm.suites.make(policy.config) as env:  # as in training, in processes of its own
+with vawm.runs.suites.make(policy.config) as env:  # as in training, in processes of its own
     carry, timestep = policy.initial(env.spec.num_envs), env.reset(0)
     carry, action = policy.act(jax.random.key(1), carry, timestep)"""
 OWN_USAGE = f"""{LOAD}\

@@ -24,8 +24,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from vawm import command_line, flags
 from vawm import config as config_lib
+from vawm.cli import command_line, flags
 from vawm.errors import InvalidInput
 from vawm.sweep import ablation
 from vawm.sweep.runs import Variant

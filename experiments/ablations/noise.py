@@ -13,7 +13,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from vawm import command_line
+from vawm.cli import command_line
 from vawm.errors import InvalidInput
 from vawm.sweep import ablation
 from vawm.sweep.runs import Variant

@@ -15,8 +15,9 @@ import itertools
 import sys
 from collections.abc import Sequence
 
-from vawm import command_line, validate
+from vawm.cli import command_line
 from vawm.errors import InvalidInput
+from vawm.runs import validate
 from vawm.sweep import ablation
 from vawm.sweep.runs import Variant
 

@@ -12,10 +12,11 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
-from vawm import resume, rundir, tracking, validate
 from vawm.config import Config
 from vawm.errors import InvalidInput
-from vawm.tracking import Line
+from vawm.runs import resume, run_folder, validate
+from vawm.runs.reports import tracking
+from vawm.runs.reports.tracking import Line
 
 METRICS = (
     "loss/dynamics",
@@ -52,7 +53,7 @@ def read(logdir: pathlib.Path) -> Run:
     Raises:
       InvalidInput: there is none that measured anything.
     """
-    config, path = rundir.read_config(logdir), logdir / "metrics.jsonl"
+    config, path = run_folder.read_config(logdir), logdir / "metrics.jsonl"
     lines = tracking.read(path) if path.exists() else []
     if config is None or not lines:
         remedy = "holds no metrics; name the folder of a run that wrote some"

@@ -1,7 +1,8 @@
 """Whole episodes of a trained policy, step by step, with what its world model remembers.
 
-As in `vawm.play`, which episodes there are is fixed before the first begins. Environments are
-those of the run's own config, so rewards and ends are those that the critic was trained on.
+As in `vawm.policy.play`, which episodes there are is fixed before the first begins.
+Environments are those of the run's own config, so rewards and ends are those that the critic
+was trained on.
 
 World models that are judged each on its own policy's episodes differ in where they are judged
 too. To compare them on the same steps, one policy plays, and every world model remembers anew
@@ -20,13 +21,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vawm import evaluate, suites
+from vawm import evaluate
 from vawm.agent import Agent, PolicyCarry, make_agent
 from vawm.config import HostEnvConfig
 from vawm.envs.protocol import Environment, HostEnvironment
 from vawm.errors import InvalidInput
-from vawm.play import FRESH, How
 from vawm.policy import Policy
+from vawm.policy.play import FRESH, How
+from vawm.runs import suites
 from vawm.types import Batch, EnvSpec, Key, Params, PyTree, TimeStep, Trajectory
 
 

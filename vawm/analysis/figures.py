@@ -11,14 +11,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from vawm import video
 from vawm.analysis import saliency as saliency_lib
 from vawm.analysis import trajectories as trajectories_lib
 from vawm.analysis.curves import METRICS, Curves
 from vawm.analysis.saliency import Look
 from vawm.analysis.trajectories import Trajectories
 from vawm.analysis.values import MEASURES, Group, Report
-from vawm.runner import RunError
+from vawm.runs.reports import video
+from vawm.runs.runner import RunError
 
 DPI = 110
 COLUMNS = 12  # of a strip, at most

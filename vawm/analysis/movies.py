@@ -8,8 +8,8 @@ import warnings
 
 import numpy as np
 
-from vawm.runner import RunError
-from vawm.video import FRAMES_PER_SECOND
+from vawm.runs.reports.video import FRAMES_PER_SECOND
+from vawm.runs.runner import RunError
 
 PACKAGES = {"imageio": "imageio", "imageio_ffmpeg": "imageio-ffmpeg"}
 

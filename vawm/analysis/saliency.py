@@ -31,13 +31,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vawm import transforms
 from vawm.agent import Agent, make_agent
 from vawm.analysis import inference
 from vawm.analysis.episodes import Episodes, windows
 from vawm.distributions import on_simplex
 from vawm.envs.protocol import check_positive
 from vawm.errors import InvalidInput
+from vawm.losses import transforms
 from vawm.policy import Policy
 from vawm.types import Array, Batch, Key, Latent, Params, PyTree, is_image
 

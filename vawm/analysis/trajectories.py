@@ -11,13 +11,13 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from vawm import video
 from vawm.agent import make_agent
+from vawm.agent.open_loop import make_open_loop
 from vawm.analysis import inference
 from vawm.analysis.episodes import Episodes, windows
-from vawm.open_loop import make_open_loop
+from vawm.losses.transforms import symlog
 from vawm.policy import Policy
-from vawm.transforms import symlog
+from vawm.runs.reports import video
 from vawm.types import PyTree, is_image
 
 

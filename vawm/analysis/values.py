@@ -40,12 +40,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vawm import transforms
 from vawm.agent import Agent, make_agent
 from vawm.analysis.episodes import Episodes, select
 from vawm.analysis.inference import check, make_infer, make_prior
 from vawm.config import Config
-from vawm.objective import discount_of
+from vawm.learning.objective import discount_of
+from vawm.losses import transforms
 from vawm.policy import Policy
 from vawm.types import Array, Key, Latent, Params, PyTree
 

@@ -11,7 +11,7 @@ need derivatives of a model or a critic take it as a function. Equation numbers 
     critic_loss                                               Eq. 7   towards lambda-returns
     actor_loss, discount_weights                              Eq. 8   policy gradient
 
-What they are made of, from `vawm.returns` and `vawm.transforms`:
+What they are made of, from `vawm.losses.returns` and `vawm.losses.transforms`:
 
     lambda_returns, replay_returns                            Eq. 7   targets of the critic
     ReturnScale, init_return_scale, update_return_scale, return_scale
@@ -54,8 +54,8 @@ what is listed here equations are as we know them, not as printed there.
                                 Environment Models, arXiv 2505.22772
 """
 
-from vawm.losses.behaviour import actor_loss, critic_loss, discount_weights
-from vawm.losses.likelihood import (
+from .behaviour import actor_loss, critic_loss, discount_weights
+from .likelihood import (
     PredictionLoss,
     balanced_kl,
     batch_dynamics_loss,
@@ -65,28 +65,14 @@ from vawm.losses.likelihood import (
     prediction_loss,
     symlog_mse,
 )
-from vawm.losses.multi_step import (
+from .multi_step import (
     lambda_ac_loss,
     latent_consistency_loss,
     muzero_value_loss,
     n_step_returns,
     scale_gradient,
 )
-from vawm.losses.tempo import tempo_meta_gradient
-from vawm.losses.vagram import (
-    vagram_joint_loss,
-    vagram_loss,
-    vagram_second_order_loss,
-    vagram_taylor_loss,
-)
-from vawm.losses.value_alignment import value_alignment_loss, value_alignment_weight
-from vawm.losses.value_aware import (
-    categorical_iter_vaml_loss,
-    cvaml_loss,
-    iter_vaml_loss,
-    vaml_loss,
-)
-from vawm.returns import (
+from .returns import (
     ReturnScale,
     init_return_scale,
     lambda_returns,
@@ -94,12 +80,26 @@ from vawm.returns import (
     return_scale,
     update_return_scale,
 )
-from vawm.transforms import (
+from .tempo import tempo_meta_gradient
+from .transforms import (
     categorical_kl,
     make_two_hot,
     symexp,
     symlog,
     two_hot_cross_entropy,
+)
+from .vagram import (
+    vagram_joint_loss,
+    vagram_loss,
+    vagram_second_order_loss,
+    vagram_taylor_loss,
+)
+from .value_alignment import value_alignment_loss, value_alignment_weight
+from .value_aware import (
+    categorical_iter_vaml_loss,
+    cvaml_loss,
+    iter_vaml_loss,
+    vaml_loss,
 )
 
 __all__ = [

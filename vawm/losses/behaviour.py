@@ -6,7 +6,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from vawm.transforms import two_hot_cross_entropies
+from .transforms import two_hot_cross_entropies
 
 Array = jax.Array
 

@@ -8,7 +8,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from vawm.transforms import categorical_kl, symlog, two_hot_cross_entropy, unimix_logits
+from .transforms import categorical_kl, symlog, two_hot_cross_entropy, unimix_logits
 
 Array = jax.Array
 PyTree = Any

@@ -44,7 +44,7 @@ def muzero_value_loss(values: Array, returns: Array, mask: Array) -> Array:
     original's scaling of gradients by 1/K at each head. It also halves gradients where the
     dynamics take their state in: `scale_gradient(latent, scale=0.5)` before each step. Its
     reward and policy losses are not here; for a categorical critic it has a cross-entropy
-    instead, `vawm.transforms.two_hot_cross_entropy` to the same returns.
+    instead, `vawm.losses.transforms.two_hot_cross_entropy` to the same returns.
 
     The critic is NOT frozen: this one loss trains model and critic. Where the environment
     is stochastic its minimum is not at the true model. The original trains on absorbing states
@@ -71,8 +71,8 @@ def n_step_returns(reward: Array, discount: Array, value: Array, *, steps: int) 
 
         y_t = r_{t+1} + d_{t+1} (r_{t+2} + ... + d_{t+n-1} (r_{t+n} + d_{t+n} v_{t+n}))
 
-    As in `vawm.returns.lambda_returns`, all three are indexed by arrival: entry k belongs to
-    s_{k+1}.
+    As in `vawm.losses.returns.lambda_returns`, all three are indexed by arrival: entry k
+    belongs to s_{k+1}.
 
     Args:
       reward: `[T, ...]` r_1..r_T, in units of the environment or of the caller's choice.

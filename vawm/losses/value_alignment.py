@@ -6,7 +6,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from vawm.transforms import categorical_kl
+from .transforms import categorical_kl
 
 Array = jax.Array
 

@@ -15,8 +15,9 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 from vawm import config as config_lib
-from vawm import flags, validate
 from vawm.analysis.tables import write_csv
+from vawm.cli import flags
+from vawm.runs import validate
 from vawm.sweep import children, figures, results, runs
 from vawm.sweep.runs import PROGRAMS, Sweep, Variant
 

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from vawm import signals
+from vawm.process import signals
 
 POLL_SECONDS = 0.1
 """Well below `signals.BURST_SECONDS`: a child to which a terminal has sent Ctrl-C already takes

@@ -9,13 +9,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from vawm import flags, overhead
 from vawm.analysis.figures import panels
 from vawm.analysis.tables import write_csv
+from vawm.cli import flags
 from vawm.envs.protocol import check_positive
-from vawm.overhead import Measured, percent_more, quartiles
-from vawm.sweep import ablation, runs
+from vawm.sweep import ablation, overhead, runs
 from vawm.sweep.ablation import Ablation, Compared
+from vawm.sweep.overhead import Measured, percent_more, quartiles
 from vawm.sweep.results import line
 from vawm.sweep.runs import Run, Sweep
 

@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vawm import tracking
 from vawm.analysis.values import mean_and_error
-from vawm.runner import RunError
+from vawm.runs.reports import tracking
+from vawm.runs.runner import RunError
 from vawm.sweep import runs
 from vawm.sweep.runs import Run, Sweep
 

@@ -11,11 +11,12 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from vawm import checkpoint, command_line, resume, rundir, suites, validate
 from vawm.analysis import figures as analysis_figures
+from vawm.cli import command_line
 from vawm.config import Config
 from vawm.envs.protocol import check_positive
 from vawm.errors import InvalidInput
+from vawm.runs import checkpoint, resume, run_folder, suites, validate
 from vawm.sweep.children import Job
 
 PROGRAMS = {
@@ -92,7 +93,7 @@ def flags(sweep: Sweep, run: Run) -> tuple[str, ...]:
 def command(sweep: Sweep, run: Run) -> list[str]:
     """What begins the run, or goes on with it where it was begun."""
     path = folder(sweep, run)
-    again = [] if rundir.read_config(path) is None else ["--resume"]
+    again = [] if run_folder.read_config(path) is None else ["--resume"]
     words = [*flags(sweep, run), "--logdir", str(path), *again]
     return [sys.executable, str(sweep.program), *words]
 
@@ -107,7 +108,7 @@ def env_steps(sweep: Sweep, run: Run) -> int | None:
     """How long the run is to be; None where only its preset knows, and it was not begun."""
     if sweep.env_steps is not None:
         return sweep.env_steps
-    config = rundir.read_config(folder(sweep, run))
+    config = run_folder.read_config(folder(sweep, run))
     return config.env_steps if config else None
 
 
@@ -150,7 +151,7 @@ def check_begun(path: pathlib.Path, config: Config) -> None:
     Raises:
       InvalidInput: names the first setting that differs.
     """
-    begun = rundir.read_config(path)
+    begun = run_folder.read_config(path)
     if begun is None:
         return
     saved = dict(validate.values(begun))
@@ -186,7 +187,7 @@ def check_places(*, jobs: int, runs: pathlib.Path | None, results: pathlib.Path)
       RunError: matplotlib is missing.
     """
     check_positive("jobs", jobs)
-    rundir.check_writable(results, "results")
+    run_folder.check_writable(results, "results")
     if runs is not None:
-        rundir.check_writable(runs, "runs")
+        run_folder.check_writable(runs, "runs")
     analysis_figures.check()

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 
 from vawm import nets
 from vawm.errors import InvalidInput
-from vawm.transforms import symlog
+from vawm.losses.transforms import symlog
 from vawm.types import IMAGE_SIZES, Array, EnvSpec, Key, PyTree, is_image
 
 

@@ -28,10 +28,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vawm import streams
 from vawm.envs.host.channel import Channel, Fields, view
 from vawm.envs.host.simulator import Outcome, Simulator
 from vawm.errors import InvalidInput
+from vawm.process import streams
 from vawm.types import ArraySpec, PyTree
 
 IDLE = -1  # in place of an environment, between two orders

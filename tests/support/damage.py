@@ -1,0 +1,88 @@
+"""Harm done to files of a checkpoint, and what must come of it."""
+
+import pytest
+import toy
+from runs import files_of
+
+from vawm.errors import InvalidInput
+from vawm.runs import checkpoint
+
+
+def flip(file):
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 1
+    file.write_bytes(content)
+
+
+def truncate(file):
+    file.write_bytes(file.read_bytes()[:-1])
+
+
+def delete(file):
+    file.unlink()
+
+
+def harms(rng):
+    """Name -> what does it to a file, one of all `files`."""
+
+    def at(content):
+        return rng.randrange(len(content))
+
+    def bit(file, _):
+        content = bytearray(file.read_bytes())
+        content[at(content)] ^= 1 << rng.randrange(8)
+        file.write_bytes(content)
+
+    def cut(file, _):
+        content = file.read_bytes()
+        file.write_bytes(content[: at(content)])
+
+    def zeros(file, _):
+        content = bytearray(file.read_bytes())
+        start = at(content)
+        content[start : start + 16] = bytes(len(content[start : start + 16]))
+        file.write_bytes(content)
+
+    def noise(file, _):
+        file.write_bytes(rng.randbytes(len(file.read_bytes())))
+
+    def inserted(file, _):
+        content = bytearray(file.read_bytes())
+        content[(start := at(content)) : start] = rng.randbytes(rng.randrange(1, 9))
+        file.write_bytes(content)
+
+    def another(file, files):
+        file.write_bytes(rng.choice(files).read_bytes())
+
+    def folder(file, _):
+        file.unlink()
+        file.mkdir()
+
+    def gone(file, _):
+        file.unlink()
+
+    return (bit, bit, bit, cut, zeros, noise, inserted, another, folder, gone)
+
+
+def corrupt(logdir, expected, count, rng):
+    """Does something to the only checkpoint, which holds `expected`, `count` times.
+
+    Returns how often that was refused, as it has to be where a file has changed.
+    """
+    files = files_of(logdir)
+    contents = {file: file.read_bytes() for file in files}
+    refused = 0
+    for _ in range(count):
+        file, harm = rng.choice(files), rng.choice(harms(rng))
+        harm(file, files)
+        if file.is_file() and file.read_bytes() == contents[file]:
+            toy.assert_equal(checkpoint.restore(logdir, expected)[0], expected)
+        else:
+            with pytest.raises(InvalidInput) as error:
+                checkpoint.restore(logdir, expected)
+            assert "\n" not in str(error.value)
+            refused += 1
+        if file.is_dir():
+            file.rmdir()
+        file.write_bytes(contents[file])
+    return refused

@@ -1,0 +1,157 @@
+"""Random configs: tiny ones of every agent, a few of whose choices are anything at all.
+
+Each has to be refused by the name of a choice, or to train.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+import pathlib
+import typing
+from collections.abc import Callable
+
+import jax
+import tiny
+import tiny_pixels
+import tiny_storm
+import tiny_vagram
+from hypothesis import strategies as st
+
+from vawm import config as config_lib
+from vawm.agent import make_agent
+from vawm.config import Config
+from vawm.errors import InvalidInput
+from vawm.learning import train
+from vawm.runs import diagnosis, runner, validate
+from vawm.types import EnvSpec
+
+STEPS = 50  # of a config that does not come to its second update before
+
+PIXELS = {
+    suite: tiny_pixels.config(
+        suite=suite,
+        env=kind(workers=1),
+        action_repeat=4 if suite == "atari100k" else 1,
+        env_steps=4 * tiny.CONFIG.env_steps,
+    )
+    for suite, kind in config_lib.ENV_CONFIGS.items()
+    if issubclass(kind, config_lib.HostEnvConfig)
+}
+"""From images, in environments of every suite on the host."""
+BASES = {"dreamerv3": tiny.CONFIG, "storm": tiny_storm.CONFIG, "vagram": tiny_vagram.CONFIG}
+
+USUAL_INTS = st.integers(1, 9) | st.sampled_from([0, 16, 24, 32, 48, 64, 200])
+INTS = USUAL_INTS | st.sampled_from([-1, 255, 1000, 10**6, 2**31 - 1, 2**31, 2**32, 10**12])
+USUAL_FLOATS = st.floats(0, 2) | st.sampled_from([0.0, 0.5, 1.0, 1e-3, 10.0, 333.0])
+FLOATS = USUAL_FLOATS | st.sampled_from([-1.0, 1e-30, 1e30, math.nan, math.inf, -math.inf])
+JUNK = st.none() | st.booleans() | st.text(max_size=3) | st.just([]) | FLOATS | INTS
+
+
+def value_of(kind: typing.Any) -> st.SearchStrategy:
+    """Mostly what the type allows, sometimes junk."""
+    if typing.get_origin(kind) is typing.Literal:
+        usual = st.sampled_from(typing.get_args(kind))
+    elif kind is bool:
+        usual = st.booleans()
+    elif kind is int:
+        usual = USUAL_INTS
+    elif kind is float:
+        usual = USUAL_FLOATS
+    else:
+        usual = st.text(max_size=3)
+    return st.one_of(usual, usual, usual, INTS if kind is int else FLOATS, JUNK)
+
+
+class Nothing:
+    """In the place of `tiny_pixels.pool()`: what is known before any process is started."""
+
+    restarts = 0
+
+    def __init__(self, action_repeat):
+        obs, num_envs = tiny_pixels.Lamp.obs, tiny.CONFIG.num_envs
+        self.spec = EnvSpec("lamp", obs, 2, True, num_envs, action_repeat, 4)
+
+    def close(self):
+        pass
+
+
+@st.composite
+def configs(draw: st.DrawFn, bases: typing.Mapping[str, Config] = BASES) -> Config:
+    config = bases[draw(st.sampled_from(sorted(bases)))]
+    fields = list(validate.fields(config))
+    count = draw(st.integers(1, 4))
+    chosen = draw(st.lists(st.sampled_from(fields), min_size=count, max_size=count))
+    for name, _, kind in chosen:
+        config = replace(config, name, draw(value_of(kind)))
+    return config
+
+
+def replace(config: typing.Any, name: str, value: typing.Any) -> typing.Any:
+    """`config` with the field of a dotted name replaced."""
+    head, _, rest = name.partition(".")
+    if rest:
+        value = replace(getattr(config, head), rest, value)
+    return dataclasses.replace(config, **{head: value})
+
+
+NAMES = {name for b in (BASES | PIXELS).values() for name, _ in validate.values(b)}
+NAMES |= {"world_model", "optimizer", "env"}
+
+
+def refusal(config: Config, folder: pathlib.Path) -> str:
+    """Why `config` is refused, in one line that begins with the name of a choice; or ""."""
+    try:
+        runner.check(config, folder, resume=False, known_task=False)
+        on_device = config.suite == "dmc_proprio"
+        runner.prepare(config, tiny.env() if on_device else Nothing(config.action_repeat))
+    except InvalidInput as error:
+        if error.field not in NAMES or "\n" in str(error):
+            raise AssertionError(f"not one line about a choice: {error}") from error
+        return str(error)
+    return ""
+
+
+def trace(config: Config) -> None:
+    """The whole training step of a config that is not refused: states lead to their like."""
+    init, step = programs(config)
+    before = jax.eval_shape(init, jax.random.key(0))
+    after, metrics = jax.eval_shape(step, before)
+    check_alike(before, after)
+    assert all(metric.shape == () for metric in metrics.values())
+
+
+def run(config: Config) -> str:
+    """As `trace`, but compiled and done, until two updates, and what came of it.
+
+    "learned": all that is learned stays finite. "diagnosed": it does not, and a run would say
+    so. "collected": there was no second update in as many steps.
+    """
+    init, step = programs(config)
+    step = jax.jit(step)
+    state = jax.jit(init)(jax.random.key(0))
+    for _ in range(STEPS):
+        before = jax.eval_shape(lambda x: x, state)
+        state, metrics = step(state)
+        check_alike(before, state)
+        if diagnosis.reason(state, jax.device_get(metrics), last=True):
+            return "diagnosed"
+        if int(state.learner.step) >= 2:
+            return "learned"
+    return "collected"
+
+
+def programs(config: Config) -> tuple[Callable, Callable]:
+    """The functions that begin and continue a run of `config`."""
+    env = tiny.env()
+    agent = make_agent(config, env.spec)
+    return functools.partial(train.init, env, agent, config), train.make_train_step(
+        env, agent, config
+    )
+
+
+def check_alike(before: typing.Any, after: typing.Any) -> None:
+    assert jax.tree.structure(after) == jax.tree.structure(before)
+    for new, old in zip(jax.tree.leaves(after), jax.tree.leaves(before), strict=True):
+        assert (new.shape, new.dtype) == (old.shape, old.dtype)

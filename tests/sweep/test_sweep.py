@@ -1,0 +1,369 @@
+"""Sweeps over a program that trains nothing: what is started, stopped, read and written."""
+
+import os
+import pathlib
+import signal
+import sys
+import threading
+import time
+
+import analysis_drawings
+import numpy as np
+import pytest
+import tiny
+
+from vawm.analysis import tables
+from vawm.cli import command_line
+from vawm.errors import InvalidInput
+from vawm.runs import run_folder
+from vawm.runs.runner import RunError
+from vawm.sweep import children, figures, results, runs
+from vawm.sweep.runs import Run, Sweep, Variant
+
+# Takes the flags of a program of ours, of which `--behave` says how the run goes: it leaves
+# what a run leaves, then fails, or waits for a signal and saves.
+PROGRAM = """
+import json, os, pathlib, shutil, signal, sys, time
+
+words = sys.argv[1:]
+resumed = "--resume" in words
+words = [word for word in words if word != "--resume"]
+flags = dict(zip(words[::2], words[1::2]))
+folder = pathlib.Path(flags["--logdir"])
+folder.mkdir(exist_ok=True)
+shutil.copy(pathlib.Path(__file__).with_name("config.json"), folder)
+print("resumed" if resumed else "begun", sorted(os.sched_getaffinity(0)))
+
+def leave(*lines):
+    with (folder / "metrics.jsonl").open("a") as file:
+        for steps, value in lines:
+            line = {"env_steps": steps, "updates": steps // 8, "time": 6.0 * steps}
+            file.write(json.dumps(line | {"episode/return": value, "loss": 1 / 3}) + "\\n")
+
+if flags["--behave"] == "fail" and flags["--seed"] == "1":
+    leave((32, 1.0))
+    sys.exit(3)
+if flags["--behave"] == "hang":
+    def save(*_):
+        (folder / "saved").touch()
+        sys.exit(143)
+    signal.signal(signal.SIGTERM, save)
+    (folder / "ready").touch()
+    time.sleep(60)
+seed = int(flags["--seed"])
+leave((32, 1.0 + seed), (64, None), (96, 3.0 + 3 * seed))
+(folder / "checkpoints" / "000000000096").mkdir(parents=True)
+"""
+
+
+def make_sweep(folder, *behaviours, **changes):
+    """A sweep of runs that behave like this, with the length of `tiny.CONFIG`."""
+    program = folder / "program.py"
+    program.write_text(PROGRAM)
+    run_folder.write_config(folder, tiny.CONFIG)
+    variants = tuple(Variant(name, ("--behave", name)) for name in behaviours)
+    given = {"variants": variants, "tasks": ("a/b",), "seeds": (0, 1)} | changes
+    return Sweep(program=program, folder=folder / "runs", **given)
+
+
+def log(sweep, run):
+    return runs.log(sweep, run).read_text()
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A sweep that was run, in which a seed failed, and what came of it."""
+    sweep = make_sweep(tmp_path_factory.mktemp("sweep"), "finish", "fail")
+    return sweep, children.run(runs.unfinished_jobs(sweep), at_once=2)
+
+
+def test_runs_that_fail_are_named_with_their_exit_codes(finished):
+    _, outcome = finished
+    ((job, code),) = outcome.failed
+    assert (job.name, code, outcome.exit_code) == ("a/b fail seed=1", 3, 0)
+    assert job.log.name == "a-b-fail-seed1.log"
+
+
+def test_every_run_has_its_share_of_the_cores(finished):
+    sweep, _ = finished
+    cores = sorted(os.sched_getaffinity(0))
+    shares = {f"begun {cores[i::2]}\n" for i in range(2)}
+    assert {log(sweep, run) for run in runs.all_runs(sweep)} <= shares
+
+
+def test_what_is_finished_is_skipped_and_what_was_begun_is_resumed(tmp_path):
+    sweep = make_sweep(tmp_path, "finish", seeds=(0, 1, 2))
+    first, second, third = runs.all_runs(sweep)
+    children.run(runs.unfinished_jobs(sweep)[:1], at_once=1)
+    runs.folder(sweep, second).mkdir()
+    run_folder.write_config(runs.folder(sweep, second), tiny.CONFIG)
+    assert [runs.finished(sweep, run) for run in (first, second, third)] == [True, False, False]
+    assert [job.name for job in runs.unfinished_jobs(sweep)] == [str(second), str(third)]
+    assert not children.run(runs.unfinished_jobs(sweep), at_once=1).failed
+    assert [log(sweep, run).split()[0] for run in (first, second, third)] == [
+        "begun",
+        "resumed",
+        "begun",
+    ]
+    assert not runs.unfinished_jobs(sweep)
+    longer = runs.dataclasses.replace(sweep, env_steps=97)
+    assert len(runs.unfinished_jobs(longer)) == 3
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_stops_the_children_which_save(tmp_path, number):
+    sweep = make_sweep(tmp_path, "hang", seeds=(0, 1, 2))
+    folders = [runs.folder(sweep, run) for run in runs.all_runs(sweep)]
+
+    def interrupt():
+        deadline = time.monotonic() + 30
+        while not all((folder / "ready").exists() for folder in folders[:2]):
+            if time.monotonic() > deadline:
+                break
+            time.sleep(0.02)
+        os.kill(os.getpid(), number)
+
+    thread = threading.Thread(target=interrupt)
+    thread.start()
+    outcome = children.run(runs.unfinished_jobs(sweep), at_once=2)
+    thread.join()
+    assert outcome == children.Outcome([], 128 + number)
+    assert [(folder / "saved").exists() for folder in folders] == [True, True, False]
+    assert not folders[2].exists()
+
+
+def test_children_are_stopped_when_one_cannot_be_started(tmp_path):
+    sweep = make_sweep(tmp_path, "hang")
+    job, other = runs.unfinished_jobs(sweep)
+    ready = runs.folder(sweep, runs.all_runs(sweep)[0]) / "ready"
+    wait = "import os, sys, time\nwhile not os.path.exists(sys.argv[1]): time.sleep(0.02)"
+    patient = other._replace(command=[sys.executable, "-c", wait, str(ready)])
+    with pytest.raises(FileNotFoundError):
+        children.run([job, patient, other._replace(command=["/no/such"])], at_once=2)
+    assert ready.with_name("saved").exists()
+
+
+def test_rows_hold_every_line_that_measured_something(finished):
+    sweep, _ = finished
+    rows = results.read(sweep, results.RETURN | {"loss": "loss", "other": "none"})
+    own = [row for row in rows if (row["variant"], row["seed"]) == ("finish", 1)]
+    assert [row["env_steps"] for row in own] == [32, 64, 96]
+    assert own[1] == {
+        "task": "a/b",
+        "variant": "finish",
+        "seed": 1,
+        "env_steps": 64,
+        "updates": 8,
+        "minutes": 6.4,
+        "return": None,
+        "loss": 0.33333,
+        "other": None,
+    }
+    assert [row["env_steps"] for row in results.read(sweep)] == [32, 96, 32, 96, 32, 96, 32]
+
+
+def test_seeds_that_are_missing_are_named_and_not_averaged(finished):
+    sweep, _ = finished
+    longer = runs.dataclasses.replace(sweep, seeds=(0, 1, 2))
+    done, failed = results.summarise(longer, results.read(longer))
+    assert (done.seeds, failed.seeds) == ((0, 1), (0,))
+    assert done.missing == {2: "has no returns"}
+    assert failed.missing == {1: "is at 32 of 96 env steps", 2: "has no returns"}
+    assert done.last == [3.0, 6.0]
+    assert done.best == [3.0, 6.0]
+    assert done.area == [2.0, 4.0]
+    assert failed.area == [2.0]
+
+
+def test_a_shorter_sweep_reads_its_own_length_of_runs_that_went_further(finished):
+    sweep, _ = finished
+    shorter = runs.dataclasses.replace(sweep, env_steps=30)
+    rows = results.read(shorter)
+    assert {row["env_steps"] for row in rows} == {32}  # a run ends where it reaches its length
+    done, _ = results.summarise(shorter, rows)
+    assert done.last == [1.0, 2.0]
+
+
+def test_the_table_is_the_one_worked_by_hand(finished):
+    sweep, _ = finished
+    columns = results.RETURN | {"the_loss": "loss"}
+    table = results.markdown(
+        results.summarise(sweep, results.read(sweep, columns), columns),
+        factor="behaviour",
+        command="python it.py",
+        notes="Two kinds.",
+    )
+    # Of 3 and 6, and of 2 and 4: sqrt(4.5 / 2) and sqrt(2 / 2).
+    assert table == (
+        "Two kinds.\n"
+        "\n"
+        "| task | behaviour | seeds | last return | best | mean return | the loss | minutes |\n"
+        "| --- | --- | --- | --- | --- | --- | --- | --- |\n"
+        "| a/b | finish | 2 | 4.5 +- 1.5 | 4.5 +- 1.5 | 3 +- 1 | 0.333 +- 0 | 9.6 |\n"
+        "| a/b | fail | **1 of 2** | 3 | 3 | 2 | 0.333 | 9.6 |\n"
+        "\n"
+        "- Not in the means: a/b, fail, seed 1: is at 32 of 96 env steps.\n"
+        "\n"
+        "Made by `python it.py`.\n"
+    )
+
+
+def test_a_table_of_nothing_says_so(tmp_path):
+    sweep = make_sweep(tmp_path, "finish", seeds=(4,))
+    assert results.read(sweep) == []
+    with pytest.raises(RunError, match="has measured anything yet"):
+        results.read_some(sweep)
+    table = results.markdown(results.summarise(sweep, []), factor="x", command="c", notes="n")
+    assert "| a/b | finish | **0 of 1** | - | - | - | - |" in table
+    assert "a/b, finish, seed 4: has no returns" in table
+
+
+def test_the_error_is_that_of_the_mean_and_none_for_a_single_run():
+    values = [812.0, 790.5, 801.25]
+    error = np.std(values, ddof=1) / np.sqrt(3)
+    assert results.with_error(values) == f"{np.mean(values):.1f} +- {error:.1f}"
+    assert results.with_error(values[:1]) == "812.0"
+    assert results.with_error([]) == "-"
+
+
+@pytest.mark.parametrize("count", [2, 3, 20])
+def test_the_area_is_that_of_the_trapezoids(count):
+    rng = np.random.default_rng(count)
+    steps, values = np.cumsum(rng.integers(1, 9, count)), rng.normal(size=count)
+    rows = [{"env_steps": s, "return": v} for s, v in zip(steps, values, strict=True)]
+    area = 0.0
+    for i in range(count - 1):
+        area += (steps[i + 1] - steps[i]) * (values[i] + values[i + 1]) / 2
+    np.testing.assert_allclose(results.area(rows), area / (steps[-1] - steps[0]))
+
+
+def test_the_area_of_uneven_steps_is_the_one_worked_by_hand():
+    rows = [{"env_steps": s, "return": v} for s, v in [(10, 1.0), (20, 3.0), (40, 5.0)]]
+    assert results.area(rows) == pytest.approx((10 * 2 + 20 * 4) / 30)
+    assert results.area(rows[:1]) == 1.0
+
+
+def test_other_columns_are_means_over_the_last_tenth_of_a_run():
+    lines = [(80, 100.0), (90, 10.0), (91, 1.0), (95, 2.0), (100, 6.0)]
+    rows = [{"env_steps": steps, "loss": loss} for steps, loss in lines]
+    assert results.late_mean(rows, "loss") == (1.0 + 2.0 + 6.0) / 3
+    assert results.late_mean(rows[:1], "loss") == 100.0
+
+
+def test_curves_are_compared_where_all_of_them_are():
+    def curve(*pairs):
+        return [{"env_steps": s, "return": v} for s, v in pairs]
+
+    steps, values = figures.interpolated(
+        [curve((0, 0.0), (10, 10.0), (20, 0.0)), curve((5, 1.0), (15, 3.0))], "return"
+    )
+    np.testing.assert_array_equal(steps, [5, 10, 15])
+    np.testing.assert_allclose(values, [[5, 10, 5], [1, 2, 3]])
+
+
+@pytest.mark.parametrize("seeds", ["lines", "band"])
+def test_figures_are_drawn_with_a_panel_for_everything(finished, seeds, tmp_path):
+    sweep, _ = finished
+    rows = results.read(sweep, results.RETURN | {"loss": "loss"})
+    sweep = runs.dataclasses.replace(sweep, tasks=("a/b", "never begun"))
+    path = tmp_path / "figure.png"
+    figures.plot(rows, sweep, path, quantities=("return", "loss"), seeds=seeds)
+    data = path.read_bytes()
+    width, height = (int.from_bytes(data[i : i + 4], "big") for i in (16, 20))
+    assert (width, height) == (2 * 495, 2 * 352)
+
+
+def test_a_band_leaves_out_the_seed_that_the_table_leaves_out(finished, tmp_path, monkeypatch):
+    drawn = analysis_drawings.keep(monkeypatch)
+    sweep, _ = finished
+    figures.plot(results.read(sweep), sweep, tmp_path / "band.png", seeds="band")
+    (panel,) = drawn["band.png"].axes
+    lines = analysis_drawings.lines(panel)
+    assert lines.keys() == {"finish", "fail (1 of 2 seeds)"}
+    np.testing.assert_array_equal(lines["finish"], [1.5, 4.5])
+    np.testing.assert_array_equal(lines["fail (1 of 2 seeds)"], [1.0, 3.0])
+
+
+def test_columns_are_written_in_order_under_their_headings(finished, tmp_path):
+    sweep, _ = finished
+    path = tmp_path / "table.csv"
+    columns = results.RETURN | {"loss": "loss"}
+    rows = results.read(sweep, columns)[1:2]
+    tables.write_csv(results.headed(rows, "behaviour"), path)
+    assert path.read_text() == (
+        "task,behaviour,seed,env_steps,updates,minutes,return,loss\n"
+        "a/b,finish,0,64,8,6.4,,0.33333\n"
+    )
+
+
+def test_folders_have_plain_names(tmp_path):
+    sweep = make_sweep(tmp_path, "static 0.5, on")
+    run = Run("vawm/GridWorld-v0", "static 0.5, on", 3)
+    name = "vawm-GridWorld-v0-static-0.5-on-seed3"
+    assert runs.folder(sweep, run) == tmp_path / "runs" / name
+    assert runs.log(sweep, run) == tmp_path / "runs" / f"{name}.log"
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"tasks": ()}, "tasks=(): use at least one"),
+        ({"seeds": (1, 1)}, "seeds=(1, 1): use at least one, and each once"),
+        ({"seeds": (0, -1)}, "seed=-1: use a number from 0"),
+        ({"tasks": ("walker_run", "walker_wlak")}, "task='walker_wlak': did you mean"),
+        ({"env_steps": 8}, "env_steps=8: use at least 2048"),
+        ({"flags": ("--preset", "quik")}, "preset='quik': did you mean 'quick'"),
+        ({"variants": (Variant("a", ("--sede", "1")),)}, "--sede='1': no such flag"),
+    ],
+)
+def test_what_every_run_would_refuse_is_refused_at_once(changes, message, tmp_path):
+    given = {"tasks": ("walker_run",), "variants": (Variant("plain", ()),)} | changes
+    with pytest.raises(InvalidInput) as refusal:
+        runs.check(make_sweep(tmp_path, **given), "dmc_proprio")
+    assert str(refusal.value).startswith(message)
+
+
+QUICK = {"tasks": ("walker_run",), "variants": (Variant("plain", ()),)}
+
+
+def begin(sweep, run, **changes):
+    """Leaves what a run leaves that was begun in a sweep with these changes."""
+    config = runs.parsed(runs.dataclasses.replace(sweep, **changes), run, "dmc_proprio")
+    runs.folder(sweep, run).mkdir(parents=True)
+    run_folder.write_config(runs.folder(sweep, run), config)
+
+
+def test_a_sweep_does_not_mix_the_warm_ups_of_runs_of_two_lengths(tmp_path):
+    sweep = make_sweep(tmp_path, **QUICK, env_steps=80_000)
+    first, second = runs.all_runs(sweep)
+    begin(sweep, first)
+    runs.check(sweep, "dmc_proprio")
+    begin(sweep, second, env_steps=40_000)
+    path = runs.folder(sweep, second)
+    with pytest.raises(InvalidInput) as refusal:
+        runs.check(sweep, "dmc_proprio")
+    assert str(refusal.value) == (
+        f"value_alignment.warmup_steps=4800: {path} was begun with 2400; use another --runs, "
+        "or its --env-steps 40000"
+    )
+
+
+def test_a_sweep_of_the_paper_can_be_made_longer(tmp_path):
+    """Its warm-up does not depend on the length, and nothing else does."""
+    sweep = make_sweep(tmp_path, **QUICK, env_steps=80_000, flags=("--preset", "paper"))
+    for run in runs.all_runs(sweep):
+        begin(sweep, run, env_steps=40_000)
+    runs.check(sweep, "dmc_proprio")
+
+
+def test_runs_of_another_preset_are_not_taken_for_those_of_a_sweep(tmp_path):
+    sweep = make_sweep(tmp_path, **QUICK, flags=("--preset", "paper"))
+    begin(sweep, runs.all_runs(sweep)[0], flags=())
+    with pytest.raises(InvalidInput, match=r"preset='paper': .* was begun with 'quick'; use"):
+        runs.check(sweep, "dmc_proprio")
+
+
+def test_programs_are_there_for_every_suite():
+    folder = pathlib.Path(__file__).parents[2] / "experiments"
+    assert all((folder / name).exists() for name in runs.PROGRAMS.values())
+    assert set(runs.PROGRAMS) == set(command_line.config_lib.ENV_CONFIGS)

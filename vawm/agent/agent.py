@@ -1,0 +1,127 @@
+"""An agent: a world model, an actor and a critic, and how they act."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from vawm.agent.actor_critic import Actor, Critic, make_actor, make_critic
+from vawm.config import Config, RSSMConfig, StormConfig, VagramConfig
+from vawm.types import Array, EnvSpec, Key, Params, PyTree, TimeStep
+from vawm.world_model.protocol import WorldModel
+from vawm.world_model.rssm import rssm
+from vawm.world_model.storm import storm
+
+
+class PolicyCarry(NamedTuple):
+    """What an agent remembers between observations."""
+
+    memory: PyTree  # the world model's
+    action: Array  # [N, A], the raw action that left from the previous observation
+
+
+class Agent(NamedTuple):
+    """Pure functions of parameters; holds no arrays but constants."""
+
+    spec: EnvSpec
+    world_model: WorldModel
+    actor: Actor
+    critic: Critic
+
+    def init(self, key: Key) -> tuple[Params, PyTree]:
+        """Fresh parameters, and the state of the world model beside them."""
+        key_world_model, key_actor, key_critic = jax.random.split(key, 3)
+        world_model, state = self.world_model.init(key_world_model)
+        actor, critic = self.actor.init(key_actor), self.critic.init(key_critic)
+        return Params(world_model, actor, critic), state
+
+    def initial(self, batch_size: int) -> PolicyCarry:
+        """The carry before the first observation."""
+        return PolicyCarry(
+            memory=self.world_model.initial(batch_size),
+            action=jnp.zeros((batch_size, self.spec.action_size)),
+        )
+
+    def act(
+        self,
+        params: Params,
+        state: PyTree,
+        key: Key,
+        carry: PolicyCarry,
+        timestep: TimeStep,
+        *,
+        how: Literal["collect", "sample", "mode"] = "sample",
+    ) -> tuple[PolicyCarry, Array]:
+        """Filter `timestep` (`[N, ...]`) and choose an action.
+
+        The action is raw: environments clip it. It is zero where an episode has ended,
+        since nothing leaves from a last observation.
+
+        Args:
+          params: of the agent.
+          state: of its world model.
+          key: for latents and actions.
+          carry: what the agent remembers.
+          timestep: what has arrived.
+          how: sample the policy; sample what collects, at its temperature; or take the
+            policy's mode.
+        """
+        key_filter, key_action = jax.random.split(key)
+        memory, latent = self.world_model.filter(
+            params.world_model,
+            state,
+            key_filter,
+            carry.memory,
+            timestep.obs,
+            carry.action,
+            timestep.is_first,
+        )
+        choose = self.actor.behaviour if how == "collect" else self.actor.policy
+        policy = choose(params.actor, latent)
+        action = policy.mode() if how == "mode" else policy.sample(key_action)
+        action = jnp.where(timestep.is_last[:, None], 0.0, action)
+        return PolicyCarry(memory, action), action
+
+    def random_action(self, key: Key, timestep: TimeStep) -> Array:
+        """Any action, each as likely as another: of all choices, or of all in [-1, 1]."""
+        shape = (*timestep.is_last.shape, self.spec.action_size)
+        if self.spec.discrete:
+            chosen = jax.random.randint(key, shape[:-1], 0, shape[-1])
+            action = jax.nn.one_hot(chosen, shape[-1])
+        else:
+            action = jax.random.uniform(key, shape, minval=-1.0, maxval=1.0)
+        return jnp.where(timestep.is_last[:, None], 0.0, action)
+
+
+def resolve_dtype(compute_dtype: str) -> jnp.dtype:
+    """The dtype of products: "auto" is bfloat16 on an accelerator, float32 on CPU."""
+    if compute_dtype == "auto":
+        compute_dtype = "float32" if jax.default_backend() == "cpu" else "bfloat16"
+    return jnp.dtype(compute_dtype)
+
+
+def make_agent(config: Config, spec: EnvSpec) -> Agent:
+    """The agent that `config` describes, for environments of `spec`."""
+    dtype = resolve_dtype(config.compute_dtype)
+    model, noise = config.world_model, config.value_alignment.noise
+    feature_size = model.deter + model.stoch * model.classes
+    if isinstance(model, StormConfig):
+        world_model = storm(model, spec, dtype=dtype, noise=noise)
+    elif isinstance(model, RSSMConfig):
+        deterministic = isinstance(model, VagramConfig)
+        world_model = rssm(model, spec, dtype=dtype, noise=noise, deterministic=deterministic)
+    else:
+        raise TypeError(f"no world model for {type(model).__name__}")
+    return Agent(
+        spec=spec,
+        world_model=world_model,
+        actor=make_actor(config.actor, spec, feature_size, dtype),
+        critic=make_critic(config.critic, feature_size, dtype),
+    )
+
+
+def parameter_count(params: PyTree) -> int:
+    """Number of learned scalars."""
+    return sum(x.size for x in jax.tree.leaves(params))

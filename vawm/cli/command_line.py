@@ -1,0 +1,257 @@
+"""The command line of experiments: tyro over `Config`, two phases, one line per error.
+
+`--agent`, `--preset` and `--size` choose the defaults, or `--resume` takes those of the saved
+run; every other flag then overrides one field of `Config`. Two fields follow from others: a new
+run of a small preset gets a warm-up for its length, and one with widths of its own is of size
+custom.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import datetime
+import pathlib
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated, NamedTuple
+
+import tyro
+
+from vawm import config as config_lib
+from vawm import presets
+from vawm.cli import flags as flags_lib
+from vawm.config import Config
+from vawm.envs.protocol import EnvironmentFailure
+from vawm.errors import InvalidInput
+from vawm.process import cache, streams
+from vawm.runs import resume, runner, validate
+from vawm.runs.checkpoint import SaveError
+from vawm.runs.runner import RunError
+
+
+class Arguments(NamedTuple):
+    """What a command line says."""
+
+    config: Config
+    logdir: pathlib.Path
+    resume: bool
+    fresh: bool = False
+
+
+@dataclasses.dataclass(frozen=True)
+class Flags:
+    """What tyro reads: the fields of `Config`, and these."""
+
+    config: Annotated[Config, tyro.conf.arg(name="")]
+    logdir: pathlib.Path | None = None
+    """folder of the run; `runs/<suite>/<task>/<preset>-seed<seed>-<time>` if not given"""
+    resume: bool = False
+    """continue the run in --logdir, with its own settings as defaults"""
+    fresh: bool = False
+    """start over in --logdir; what is there is moved into a folder replaced-1, -2 ... in it"""
+
+
+def train(
+    argv: Sequence[str] | None,
+    *,
+    suite: str,
+    description: str,
+    aliases: Mapping[str, str] | None = None,
+) -> int:
+    """What an experiment does: reads its command line and trains; returns the exit code."""
+    arguments = parse(argv, suite=suite, description=description, aliases=aliases)
+    config, logdir = arguments.config, arguments.logdir
+    runner.check(config, logdir, resume=arguments.resume, fresh=arguments.fresh)
+    cache.enable()
+    result = runner.run(
+        config,
+        logdir,
+        resume=arguments.resume,
+        fresh=arguments.fresh,
+        banner=describe(config),
+        command=f"python {pathlib.Path(sys.argv[0])}",
+    )
+    return result.exit_code
+
+
+def parse(
+    argv: Sequence[str] | None,
+    *,
+    suite: str,
+    description: str,
+    preset: str = "quick",
+    aliases: Mapping[str, str] | None = None,
+) -> Arguments:
+    """Reads `argv` (of the process if None).
+
+    Args:
+      argv: the words after the program's name.
+      suite: whose presets there are to choose from.
+      description: for the help.
+      preset: the default one.
+      aliases: flag -> the flag that it stands for.
+
+    Raises:
+      InvalidInput: an unknown preset, size or flag, a wrong type, nothing to resume, or a
+        run of another suite.
+      SystemExit: help was asked for (0).
+    """
+    argv = list(sys.argv[1:] if argv is None else argv)
+    argv = [_without_alias(word, aliases or {}) for word in argv]
+    default = Flags(_defaults(argv, suite, preset))
+    flags = flags_lib.read(Flags, argv, default=default, description=description)
+    if flags.fresh and flags.logdir is None:
+        raise InvalidInput("logdir", None, "--fresh needs the --logdir to start over in")
+    config = _with_its_size(flags.config)
+    if config.suite != suite:
+        remedy = f"this program runs suite {suite}; use the one of that suite"
+        raise InvalidInput("suite", config.suite, remedy)
+    return Arguments(config, flags.logdir or default_logdir(config), flags.resume, flags.fresh)
+
+
+def _without_alias(word: str, aliases: Mapping[str, str]) -> str:
+    """`--game` or `--game=breakout` as `--task` or `--task=breakout`."""
+    flag, equals, value = word.partition("=")
+    return aliases.get(flag, flag) + equals + value
+
+
+def _defaults(argv: list[str], suite: str, preset: str) -> Config:
+    """First phase: the config that the flags of the second override."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    parser.add_argument("--agent", nargs="?")
+    parser.add_argument("--preset", nargs="?")
+    parser.add_argument("--size", nargs="?")
+    parser.add_argument("--env-steps", "--env_steps", nargs="?")
+    parser.add_argument("--logdir", nargs="?")
+    parser.add_argument("--resume", action=argparse.BooleanOptionalAction)
+    try:
+        known, _ = parser.parse_known_args(argv)
+    except argparse.ArgumentError:  # --resume=value
+        raise InvalidInput("--resume", True, "takes no value; write --resume alone") from None
+    if not known.resume or {"-h", "--help"} & set(argv):
+        size = None if known.size == config_lib.CUSTOM else known.size
+        agent = known.agent or "dreamerv3"
+        config = validate.preset(agent, suite, known.preset or preset, size)
+        return _with_its_warmup(config, known.env_steps)
+    if known.logdir is None:
+        raise InvalidInput("logdir", None, "--resume needs the --logdir of the run")
+    saved = resume.saved_config(known.logdir)
+    if known.agent not in (None, saved.agent):  # whose choices are others: refused here
+        validate.check_choice("agent", known.agent, config_lib.AGENT_CONFIGS)
+        resume.check(known.logdir, dataclasses.replace(saved, agent=known.agent))
+    if known.size not in (None, saved.size, config_lib.CUSTOM):
+        validate.check_choice("size", known.size, config_lib.SIZES[saved.agent])
+        return config_lib.with_size(saved, known.size)
+    return saved
+
+
+def _with_its_warmup(config: Config, env_steps: str | None) -> Config:
+    """`config`; of a small preset, with the warm-up for a run of the length that was given."""
+    try:
+        length = int(env_steps or "")
+    except ValueError:  # none, or one that the second phase refuses
+        return config
+    if not is_small(config):
+        return config
+    warmup = scaled_warmup(config, length)
+    alignment = dataclasses.replace(config.value_alignment, warmup_steps=warmup)
+    return dataclasses.replace(config, value_alignment=alignment)
+
+
+def is_small(config: Config) -> bool:
+    """Whether this run is of a preset for a CPU: any but that of the paper."""
+    return config.preset != "paper" and config.preset in presets.of(config)
+
+
+def scaled_warmup(config: Config, env_steps: int) -> int:
+    """The warm-up of a small preset, in env steps, for another length: the same share."""
+    usual = presets.of(config)[config.preset]
+    return usual.value_alignment.warmup_steps * env_steps // usual.env_steps
+
+
+def _with_its_size(config: Config) -> Config:
+    """`config`; of size custom where a width is not the one of its size."""
+    size = config.size
+    if size not in config_lib.SIZES[config.agent] or config == config_lib.with_size(
+        config, size
+    ):
+        return config
+    return dataclasses.replace(config, size=config_lib.CUSTOM)
+
+
+def default_logdir(config: Config) -> pathlib.Path:
+    """A folder of its own for each run."""
+    now = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
+    name = f"{config.preset}-seed{config.seed}-{now}"
+    return pathlib.Path("runs") / config.suite / config.task.replace("/", "-") / name
+
+
+def describe(config: Config) -> str:
+    """What the chosen preset is for, in a few lines."""
+    head = (
+        f"{config.agent}, preset {config.preset}: {config.suite} {config.task}, "
+        f"{config.env_steps:,} env steps, size {config.size}, seed {config.seed}"
+    )
+    alignment, paper = _describe_alignment(config), presets.of(config).get("paper")
+    if not is_small(config):
+        return f"{head}\nvalue alignment: {alignment}"
+    lines = [head, "  for a CPU with 2 cores; this is not the paper's setting"]
+    lines.append(f"  value alignment: {alignment}")
+    if paper:
+        lines.append(
+            f"  the paper's setting: --preset paper ({paper.env_steps:,} env steps, "
+            f"size {paper.size}, better on a GPU)"
+        )
+    return "\n".join(lines)
+
+
+def _describe_alignment(config: Config) -> str:
+    """From when on value alignment is active, and for how much of the run."""
+    alignment = config.value_alignment
+    if alignment.weight == "off":
+        return "off"
+    in_updates = alignment.warmup_unit == "updates"
+    length = _updates(config) if in_updates else config.env_steps
+    warmup, unit = alignment.warmup_steps, alignment.warmup_unit.replace("_", " ")
+    about = "about " if in_updates else ""
+    if warmup >= length:
+        return (
+            f"never active in this run of {about}{length:,} {unit}, whose warm-up is {warmup:,}"
+        )
+    percent = 100 * (length - warmup) // length
+    share = f"{about}{percent} %" if percent else "less than 1 %"
+    text = f"active after {warmup:,} {unit}, for {share} of the run"
+    paper = presets.of(config).get("paper")
+    if paper is None or not is_small(config) or config.env_steps >= paper.env_steps:
+        return text
+    if not in_updates and warmup == scaled_warmup(config, config.env_steps):
+        scale = f"{paper.value_alignment.warmup_steps:,} of {paper.env_steps:,}"
+        text += f"; the warm-up is shortened with the run (paper: {scale})"
+    return text
+
+
+def _updates(config: Config) -> int:
+    """Updates of the whole run, but for those that the reset of each episode adds."""
+    replayed = config.env_steps // config.action_repeat - validate.smallest_replay(config)
+    return max(0, replayed) * config.train_ratio // config.replay.batch_steps
+
+
+@streams.outlive()
+def guard(main: Callable[[], int]) -> int:
+    """The exit code of `main`; what can go wrong becomes one line on standard error.
+
+    Returns:
+      2 for bad input, 1 for a run that had to stop, 130 after Ctrl-C, else main's own.
+    """
+    try:
+        return main()
+    except InvalidInput as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except (RunError, SaveError, EnvironmentFailure) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130

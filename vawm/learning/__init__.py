@@ -1,0 +1,1 @@
+"""Learning: the loss, one update, replay, and the training step."""

@@ -1,0 +1,150 @@
+"""Interaction: act, store what the action left from, take in what arrives.
+
+`depart` and `arrive` are the two halves of a step around an environment. `make_collect` puts
+a jittable environment between them; where environments run on the host, the host does.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from vawm.agent import Agent, PolicyCarry
+from vawm.config import Config
+from vawm.envs.protocol import Environment
+from vawm.learning import replay
+from vawm.learning.replay import Replay
+from vawm.types import Array, Key, Metrics, Params, PyTree, TimeStep, Trajectory
+
+
+class Collector(NamedTuple):
+    """Everything that interaction changes, but for replay."""
+
+    env_state: PyTree
+    timestep: TimeStep  # the observation that waits for an action
+    carry: PolicyCarry
+    env_steps: Array  # [] int32, control steps so far, action repeat included
+    episode_return: Array  # [N] of the running episodes
+    episode_length: Array  # [N] calls of `step` in the running episodes
+
+
+class Departure(NamedTuple):
+    """What an action leaves behind: the step to store, and what is kept beside it."""
+
+    trajectory: Trajectory  # [N, ...]
+    latent: PyTree  # [N, ...]
+
+
+Collect = Callable[[Params, PyTree, Collector, Replay, Key], tuple[Collector, Replay, Metrics]]
+
+
+def depart(
+    agent: Agent,
+    params: Params,
+    state: PyTree,
+    collector: Collector,
+    key: Key,
+    *,
+    random_steps: int,
+) -> tuple[Collector, Departure]:
+    """Acts on what has arrived. The action, `[N, A]`, is that of the departure.
+
+    Before env step `random_steps` it is a random one instead.
+    """
+    timestep = collector.timestep
+    if random_steps:
+        key, key_random = jax.random.split(key)
+        anything = agent.random_action(key_random, timestep)
+    carry, action = agent.act(params, state, key, collector.carry, timestep, how="collect")
+    if random_steps:
+        action = jnp.where(collector.env_steps < random_steps, anything, action)
+        carry = carry._replace(action=action)
+    stored = Departure(
+        Trajectory(*timestep, action=action), agent.world_model.memory(carry.memory)
+    )
+    return collector._replace(carry=carry), stored
+
+
+def arrive(
+    collector: Collector, timestep: TimeStep, *, action_repeat: int
+) -> tuple[Collector, Metrics]:
+    """Takes in what an environment answered; `collector` has its new state already.
+
+    Metrics are sums over the episodes that ended in this step, and `chunk/nonfinite`: for how
+    many environments what arrived, or the action before it, is not finite.
+    """
+    moved = ~timestep.is_first
+    episode_return = jnp.where(moved, collector.episode_return, 0.0) + timestep.reward
+    episode_length = jnp.where(moved, collector.episode_length + 1, 0)
+    ended = timestep.is_last
+    exchanged = timestep.obs, timestep.reward, collector.carry.action
+    metrics = {
+        "episode/count": jnp.sum(ended),
+        "episode/return": jnp.sum(jnp.where(ended, episode_return, 0.0)),
+        "episode/length": jnp.sum(jnp.where(ended, episode_length, 0)),
+        "chunk/nonfinite": jnp.sum(~is_finite(exchanged)),
+    }
+    return Collector(
+        env_state=collector.env_state,
+        timestep=timestep,
+        carry=collector.carry,
+        env_steps=collector.env_steps + action_repeat * jnp.sum(moved),
+        episode_return=episode_return,
+        episode_length=episode_length,
+    ), metrics
+
+
+def is_finite(exchanged: PyTree) -> Array:
+    """Whether all numbers in arrays `[N, ...]` are, per environment, `[N]`."""
+
+    def per_env(x: Array) -> Array:
+        return jnp.isfinite(x).all(range(1, x.ndim))
+
+    leaves = jax.tree.leaves(exchanged)
+    floating = (x for x in leaves if jnp.issubdtype(x.dtype, jnp.floating))
+    anyway = jnp.ones(leaves[0].shape[0], bool)
+    return functools.reduce(jnp.logical_and, map(per_env, floating), anyway)
+
+
+def make_collect(env: Environment, agent: Agent, config: Config) -> Collect:
+    """Build `collect(params, state, collector, replay, key)`: K steps in each environment."""
+
+    def step(params: Params, state: PyTree, collector: Collector, key: Key):
+        collector, stored = depart(
+            agent, params, state, collector, key, random_steps=config.random_steps
+        )
+        env_state, timestep = env.step(collector.env_state, stored.trajectory.action)
+        collector, metrics = arrive(
+            collector._replace(env_state=env_state),
+            timestep,
+            action_repeat=env.spec.action_repeat,
+        )
+        metrics["env/nonfinite"] = jnp.sum(timestep.is_last & (env_state.steps < 0))
+        return collector, (stored, metrics)
+
+    def collect(params: Params, state: PyTree, collector: Collector, buffer: Replay, key: Key):
+        keys = jax.random.split(key, config.collect_steps)
+        collector, (stored, metrics) = jax.lax.scan(
+            lambda c, k: step(params, state, c, k), collector, keys
+        )
+        trajectory, latent = jax.tree.map(lambda x: x.swapaxes(0, 1), stored)
+        buffer = replay.add(buffer, trajectory, latent)
+        return collector, buffer, jax.tree.map(jnp.sum, metrics)
+
+    return collect
+
+
+def begin(agent: Agent, timestep: TimeStep, env_state: PyTree, *, num_envs: int) -> Collector:
+    """The collector before the first action; `timestep` are first observations."""
+    return Collector(
+        env_state=env_state,
+        timestep=timestep,
+        carry=agent.initial(num_envs),
+        env_steps=jnp.zeros((), jnp.int32),
+        episode_return=jnp.zeros(num_envs),
+        episode_length=jnp.zeros(num_envs, jnp.int32),
+    )

@@ -1,0 +1,66 @@
+"""VaGraM on latents: what the prior predicts, judged by how much the value depends on it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+
+from vawm import distributions, losses
+from vawm.agent import Agent
+from vawm.config import VagramConfig
+from vawm.losses import transforms
+from vawm.types import Array, Inference, Latent, PyTree, flat_stoch
+
+FORMS = {
+    "diagonal": losses.vagram_loss,
+    "taylor": losses.vagram_taylor_loss,
+    "second_order": losses.vagram_second_order_loss,
+    "joint": losses.vagram_joint_loss,
+}
+"""Choice of `value_gradient_form` -> loss."""
+
+
+def make_value_gradient_loss(
+    agent: Agent, model: VagramConfig
+) -> Callable[[PyTree, PyTree, Inference], Array]:
+    """Build `value_gradient_loss(critic_params, slow_critic, inference) -> [B, T]`.
+
+        L = scale * sum_j (dV/dz_j)^2 (z~_j - sg z_j)^2,    dV/dz at (h_t, z_t)
+
+    (Voelcker et al., 2022, on latents: our reading), or another form of `vawm.losses.vagram`.
+    Each categorical of z sums to 1, which leaves dV/dz open up to a number for all classes of
+    one; it is centred there, and the Hessian with it, so that a critic that ignores z has no
+    loss. z~ are the probabilities of the prior, z of the posterior, after unimix; V is the
+    critic's mean, or its symlog. Gradients reach the world model through z~: the prior, and
+    h_t by way of it. The critics' parameters are stopped, and so is everything that the value
+    is differentiated at.
+    """
+    form = FORMS[model.value_gradient_form]
+
+    def value_of(critic: PyTree, deter: Array) -> Callable[[Array], Array]:
+        def value(z: Array) -> Array:
+            stoch = z.reshape(*z.shape[:-1], model.stoch, model.classes)
+            stoch = distributions.on_simplex(stoch).astype(deter.dtype)
+            mean = agent.critic.code.mean(agent.critic.logits(critic, Latent(deter, stoch)))
+            return transforms.symlog(mean) if model.value_gradient_unit == "symlog" else mean
+
+        return value
+
+    def probabilities(logits: Array) -> Array:
+        return flat_stoch(distributions.probabilities(logits, unimix=model.unimix))
+
+    def value_gradient_loss(critic: PyTree, slow_critic: PyTree, inference: Inference) -> Array:
+        target = probabilities(inference.post_logits)
+        prediction = probabilities(inference.prior_logits)
+        deter = jax.lax.stop_gradient(inference.latent.deter)
+
+        def loss(params: PyTree) -> Array:
+            value = value_of(jax.lax.stop_gradient(params), deter)
+            return model.value_gradient_scale * form(value, prediction, target)
+
+        if model.value_gradient_critic == "both":
+            return (loss(critic) + loss(slow_critic)) / 2
+        return loss(critic if model.value_gradient_critic == "online" else slow_critic)
+
+    return value_gradient_loss

@@ -1,0 +1,5 @@
+"""Trained policies: loading them, playing with them, published scores."""
+
+from vawm.policy.policy import Policy, load
+
+__all__ = ["Policy", "load"]

@@ -1,0 +1,1 @@
+"""Runs on disk: what may run, the loop, checkpoints, resuming, reports."""

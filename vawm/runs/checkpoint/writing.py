@@ -1,0 +1,158 @@
+"""Writing a checkpoint: all or nothing."""
+
+from __future__ import annotations
+
+import gc
+import os
+import pathlib
+import re
+import shutil
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from vawm.config import Config
+from vawm.runs.checkpoint import arrays, folders, snapshot
+from vawm.runs.checkpoint import manifest as manifest_lib
+from vawm.runs.checkpoint.manifest import Manifest
+from vawm.runs.checkpoint.snapshot import Snapshot
+from vawm.types import EnvSpec, PyTree
+
+
+class SaveError(RuntimeError):
+    """A checkpoint could not be written; the one before it is intact."""
+
+
+class Written(NamedTuple):
+    """A complete checkpoint, and the bytes that it takes of the disk."""
+
+    path: pathlib.Path
+    nbytes: int
+
+
+def save(
+    logdir: str | os.PathLike[str],
+    state: PyTree,
+    *,
+    env_steps: int,
+    config: Config,
+    spec: EnvSpec,
+    progress: Mapping[str, Any],
+    episodes: Mapping[str, np.ndarray] | None = None,
+) -> pathlib.Path:
+    """Writes a `TrainState` and returns when it is complete; `Saver` does not wait for that.
+
+    `episodes` are arrays of any shape beside it, see `restore_episodes`.
+
+    Raises:
+      SaveError: see `write`.
+    """
+    taken = snapshot.take(
+        state,
+        env_steps=env_steps,
+        config=config,
+        spec=spec,
+        progress=progress,
+        episodes=episodes,
+    )
+    return write(logdir, taken).path
+
+
+def write(logdir: str | os.PathLike[str], taken: Snapshot) -> Written:
+    """Writes a snapshot; deletes old checkpoints once the new one is complete.
+
+    Computes nothing with JAX, so any thread may call it; one at a time.
+
+    Raises:
+      SaveError: nothing was changed, because the disk is full, a parameter is not finite, or
+        there is a checkpoint at these env steps or later ones.
+    """
+    final = folders.folder(logdir, taken.env_steps)
+    refuse_backwards(logdir, taken.env_steps)
+    _refuse_nonfinite(taken.arrays.get("params", {}) | taken.arrays.get("model_state", {}))
+    scratch = final.with_name(folders.SCRATCH + final.name)
+    with arrays.quiet():
+        try:
+            shutil.rmtree(scratch, ignore_errors=True)
+            scratch.mkdir(parents=True)
+            for item in taken.leaves:
+                arrays.write(scratch / item, taken.arrays[item])
+            nbytes = manifest_lib.write(scratch, _manifest(taken))
+            scratch.rename(final)
+            manifest_lib.sync(final.parent)
+        except Exception as error:
+            shutil.rmtree(scratch, ignore_errors=True)
+            raise SaveError(_why_not_saved(logdir, final, taken.nbytes, error)) from error
+        finally:
+            gc.collect(1)  # Orbax leaves young cycles that hold all of it, compressed
+    folders.prune(logdir, taken.config.keep_checkpoints)
+    return Written(final, nbytes)
+
+
+def refuse_backwards(logdir: str | os.PathLike[str], env_steps: int) -> None:
+    """Refuses to save at or before the newest checkpoint.
+
+    Raises:
+      SaveError: there is one that is as new; nothing was changed.
+    """
+    newest = folders.latest(logdir)
+    if newest is not None and env_steps <= int(newest.name):
+        raise SaveError(
+            f"checkpoint {folders.folder(logdir, env_steps)} is not written: the newest one "
+            f"is at {int(newest.name)} env steps, and a run does not go backwards"
+        )
+
+
+def _manifest(taken: Snapshot) -> Manifest:
+    return Manifest(
+        version=manifest_lib.version(),
+        computed=manifest_lib.computed(),
+        env_steps=taken.env_steps,
+        config=taken.config,
+        spec=taken.spec,
+        progress=taken.progress,
+        leaves=taken.leaves,
+        files={},
+    )
+
+
+def _refuse_nonfinite(needed: Mapping[str, np.ndarray]) -> None:
+    """What acting needs has to be finite."""
+    for path, array in needed.items():
+        if not np.isfinite(array).all():
+            raise SaveError(
+                f"parameter {path} is not finite, so no checkpoint is written; start again "
+                "with a smaller --optimizer.learning-rate or another --seed"
+            )
+
+
+def _why_not_saved(
+    logdir: str | os.PathLike[str], final: pathlib.Path, needed: int, error: Exception
+) -> str:
+    reason = (str(error).strip() or repr(error)).splitlines()[0]
+    # TensorStore names file after file before what the system said, and its choices after.
+    reason = re.split(r" \[\w+='", reason)[0].rpartition('": ')[-1]
+    return (
+        f"checkpoint {final} could not be written (up to {amount(needed)} needed, "
+        f"{free_space(final.parents[1])} free): {reason[:200]}; kept: {folders.kept(logdir)}; "
+        "put that right, then go on with --resume"
+    )
+
+
+def free_space(folder: str | os.PathLike[str]) -> str:
+    """On the disk of `folder`, for people."""
+    try:
+        return amount(shutil.disk_usage(folder).free)
+    except OSError:
+        return "an unknown amount"
+
+
+def amount(nbytes: int) -> str:
+    """Bytes for people: `"337 B"`, `"1.5 MiB"`, `"57 GiB"`."""
+    size, units = float(nbytes), ["B", "KiB", "MiB", "GiB"]
+    while size >= 1024 and len(units) > 1:
+        size /= 1024
+        del units[0]
+    digits = 1 if size < 10 and units[0] != "B" else 0
+    return f"{size:.{digits}f} {units[0]}"

@@ -1,0 +1,1 @@
+"""What a run tells: metrics, trackers, videos, the progress bar."""
