@@ -11,12 +11,11 @@ It registers the tasks with Gymnasium, as `vawm/<task>-v0`, and "vawm/GridWorld-
 
 from __future__ import annotations
 
-import difflib
 from typing import TYPE_CHECKING, Any
 
 from vawm.envs.protocol import Environment, EnvState, check_positive
 from vawm.envs.registration import register
-from vawm.errors import InvalidInput
+from vawm.errors import InvalidInput, suggestion
 
 if TYPE_CHECKING:
     from vawm.envs.host.gymnasium import from_gymnasium
@@ -83,9 +82,8 @@ def check_task(task: str) -> None:
     """Refuses a name outside `TASKS`, with the nearest one."""
     if task in TASKS:
         return
-    close = difflib.get_close_matches(str(task), TASKS, n=1)
-    hint = f"did you mean {close[0]!r}? " if close else ""
-    raise InvalidInput("task", task, f"{hint}choose one of {', '.join(TASKS)}")
+    remedy = f"{suggestion(task, TASKS)}choose one of {', '.join(TASKS)}"
+    raise InvalidInput("task", task, remedy)
 
 
 def split(task: str) -> tuple[str, str]:

@@ -19,8 +19,6 @@ with 0 otherwise. Episodes end truly (`is_terminal`) after `episode_length` step
 
 from __future__ import annotations
 
-import difflib
-
 import chex
 import jax
 import jax.numpy as jnp
@@ -28,7 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vawm.envs.protocol import Environment, EnvState, check_positive
-from vawm.errors import InvalidInput
+from vawm.errors import InvalidInput, suggestion
 from vawm.types import Array, EnvSpec, Key, TimeStep, vector
 
 PROBES = (
@@ -168,9 +166,8 @@ def check_probe(name: str) -> None:
     """Refuses a name outside `PROBES`, with the nearest one."""
     if name in PROBES:
         return
-    close = difflib.get_close_matches(str(name), PROBES, n=1)
-    hint = f"did you mean {close[0]!r}? " if close else ""
-    raise InvalidInput("probe", name, f"{hint}choose one of {', '.join(PROBES)}")
+    remedy = f"{suggestion(name, PROBES)}choose one of {', '.join(PROBES)}"
+    raise InvalidInput("probe", name, remedy)
 
 
 def random_signal(key: Key, num_envs: int) -> Array:

@@ -10,7 +10,6 @@ a life.
 
 from __future__ import annotations
 
-import difflib
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ import numpy as np
 from vawm.envs.host.frames import make_resize
 from vawm.envs.host.simulator import Outcome
 from vawm.envs.protocol import check_positive
-from vawm.errors import InvalidInput
+from vawm.errors import InvalidInput, suggestion
 from vawm.types import PyTree, image
 
 GAMES = {
@@ -199,9 +198,8 @@ def check_game(name: str) -> None:
     """Refuses a name outside `GAMES`, with the nearest one."""
     if name in GAMES:
         return
-    close = difflib.get_close_matches(str(name).lower(), GAMES, n=1)
-    hint = f"did you mean {close[0]!r}? " if close else ""
-    raise InvalidInput("game", name, f"{hint}choose one of {', '.join(GAMES)}")
+    remedy = f"{suggestion(name, GAMES)}choose one of {', '.join(GAMES)}"
+    raise InvalidInput("game", name, remedy)
 
 
 def load(game: str) -> Any:

@@ -10,7 +10,6 @@ episode: everything that is wrong with it comes as one `InvalidInput`.
 from __future__ import annotations
 
 import contextlib
-import difflib
 import functools
 import importlib
 import math
@@ -28,7 +27,7 @@ from vawm.envs.host.pool import Pool
 from vawm.envs.host.simulator import Outcome, Simulator
 from vawm.envs.host.worker import one_line
 from vawm.envs.protocol import check_positive
-from vawm.errors import InvalidInput
+from vawm.errors import InvalidInput, suggestion
 from vawm.types import ArraySpec, PyTree, image, vector
 
 
@@ -156,9 +155,8 @@ def check_id(name: str) -> RegisteredEnv:
             raise InvalidInput("env", name, remedy) from None
     if registered in gymnasium.registry:
         return gymnasium.registry[registered]
-    close = difflib.get_close_matches(registered, gymnasium.registry, n=1)
-    hint = f"did you mean {close[0]!r}? " if close else ""
-    remedy = f"{hint}use a registered id, or 'module:id' to import what registers it"
+    hint = suggestion(registered, gymnasium.registry)
+    remedy = f"{hint}use a registered id, or 'module:id' to import the module that registers it"
     raise InvalidInput("env", name, remedy)
 
 

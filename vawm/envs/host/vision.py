@@ -6,7 +6,6 @@ it. So a frame is drawn only where it is seen: one per step, whatever the action
 
 from __future__ import annotations
 
-import difflib
 import math
 from typing import Any, cast
 
@@ -16,7 +15,7 @@ from vawm.envs import DOMAINS, EPISODE_STEPS, TASKS
 from vawm.envs.host import rendering
 from vawm.envs.host.simulator import Outcome
 from vawm.envs.protocol import check_positive
-from vawm.errors import InvalidInput
+from vawm.errors import InvalidInput, suggestion
 from vawm.types import PyTree, image
 
 VISION_TASKS = tuple(sorted((*TASKS, "quadruped_run", "quadruped_walk")))
@@ -137,9 +136,8 @@ def check_vision_task(task: str) -> None:
     """
     if task in VISION_TASKS:
         return
-    close = difflib.get_close_matches(str(task), VISION_TASKS, n=1)
-    hint = f"did you mean {close[0]!r}? " if close else ""
-    raise InvalidInput("task", task, f"{hint}choose one of {', '.join(VISION_TASKS)}")
+    remedy = f"{suggestion(task, VISION_TASKS)}choose one of {', '.join(VISION_TASKS)}"
+    raise InvalidInput("task", task, remedy)
 
 
 def check_camera(camera: int, domain: str, *, cameras: int) -> int:

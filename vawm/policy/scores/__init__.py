@@ -19,7 +19,6 @@ BattleZone's human score is 37187.7 in the paper's tables, 37187.5 in most other
 from __future__ import annotations
 
 import csv
-import difflib
 import functools
 import math
 import re
@@ -28,7 +27,7 @@ from collections.abc import Iterable, Mapping
 from importlib import resources
 from typing import NamedTuple
 
-from vawm.errors import InvalidInput
+from vawm.errors import InvalidInput, suggestion
 
 TABLES = (
     "atari100k",
@@ -155,6 +154,4 @@ def snake_case(name: str) -> str:
 def remedy(name: str, known: Iterable[str]) -> str:
     """What to write instead of an unknown name: the nearest known one, or any."""
     choices = list(known)
-    close = difflib.get_close_matches(str(name).lower(), choices, n=1)
-    hint = f"did you mean {close[0]!r}? " if close else ""
-    return f"{hint}choose one of {', '.join(choices)}"
+    return f"{suggestion(name, choices)}choose one of {', '.join(choices)}"
