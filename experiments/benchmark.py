@@ -29,16 +29,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from vawm import envs
-from vawm.agent import make_agent, parameter_count
+from vawm.agent import make_agent, parameter_count, registry
 from vawm.cli import flags
 from vawm.cli.command_line import guard
 from vawm.config import (
-    SIZES,
+    CUSTOM,
+    AgentName,
     Config,
-    StormConfig,
     ValueAlignmentConfig,
     VisionConfig,
-    with_size,
 )
 from vawm.envs.protocol import check_positive
 from vawm.errors import InvalidInput
@@ -46,7 +45,6 @@ from vawm.learning import from_replay, train
 from vawm.learning.collector import make_collect
 from vawm.learning.from_replay import Draw
 from vawm.learning.update import init_learner, make_update
-from vawm.presets import PAPER, STORM, vagram
 from vawm.process import huge_pages
 from vawm.runs import budget, suites, validate
 from vawm.sweep.overhead import peak_process_bytes, percent_more, quartiles
@@ -58,8 +56,8 @@ from vawm.world_model.codecs import check_image_size
 class Benchmark:
     """Time the update, its compilation, and stepping environments with the policy."""
 
-    agent: Literal["dreamerv3", "storm", "vagram"] = "dreamerv3"
-    """storm: Table 14, imagination from 1024 contexts of their own"""
+    agent: AgentName = "dreamerv3"
+    """storm: Table 14, imagination from 1024 separate contexts"""
     size: str | None = None
     """model size; 16m for storm, 1m for the others if not given"""
     batch_size: int = 16
@@ -87,11 +85,9 @@ class Benchmark:
 
 def check(options: Benchmark) -> None:
     """Refuses what cannot be measured, before anything is compiled."""
-    validate.check_choice("size", size_of(options), SIZES[options.agent])
-    positions = StormConfig().positions
-    if options.agent == "storm" and options.batch_length > positions:
-        remedy = f"use at most {positions}, the transformer's positions"
-        raise InvalidInput("batch_length", options.batch_length, remedy)
+    validate.check_choice("agent", options.agent, registry.names())
+    validate.check_choice("size", size_of(options), [*sizes_of(options), CUSTOM])
+    registry.kind(options.agent).check(make_config(options))
     envs.check_task(options.task)
     check_image_size("image_size", options.image_size)
     for field in dataclasses.fields(options):
@@ -102,14 +98,27 @@ def check(options: Benchmark) -> None:
                 raise InvalidInput(field.name, value, f"use a number below {validate.INT32}")
 
 
+def sizes_of(options: Benchmark) -> Sequence[str]:
+    return list(registry.kind(options.agent).sizes)
+
+
 def size_of(options: Benchmark) -> str:
-    return options.size or ("16m" if options.agent == "storm" else "1m")
+    """The size asked for; 16m for storm, else the smallest there is."""
+    if options.size is not None:
+        return options.size
+    return "16m" if options.agent == "storm" else next(iter(sizes_of(options)), CUSTOM)
+
+
+def paper_of(agent: str) -> Config:
+    """The paper's preset of an agent, of the proprio tasks where there is one."""
+    of_suites = registry.kind(agent).presets.values()
+    return next(named["paper"] for named in of_suites if "paper" in named)
 
 
 def make_config(options: Benchmark) -> Config:
-    paper = {"dreamerv3": PAPER, "storm": STORM, "vagram": vagram(PAPER)}[options.agent]
+    paper, size = paper_of(options.agent), size_of(options)
     return dataclasses.replace(
-        with_size(paper, size_of(options)),
+        paper if size == CUSTOM else registry.with_size(paper, size),
         compute_dtype=options.compute_dtype,
         num_envs=options.num_envs,
         action_repeat=1,

@@ -21,7 +21,7 @@ from typing import Literal, NamedTuple
 
 from vawm.analysis.tables import write_csv
 from vawm.cli import command_line, flags
-from vawm.config import ValueAlignmentConfig
+from vawm.config import AgentName, ValueAlignmentConfig
 from vawm.runs import validate
 from vawm.sweep import children, figures, results, runs
 from vawm.sweep.runs import PROGRAMS, Sweep, Variant
@@ -51,7 +51,7 @@ class Options:
         "dmc_proprio"
     )
     """the program that trains"""
-    agent: Literal["dreamerv3", "storm", "vagram"] = "dreamerv3"
+    agent: AgentName = "dreamerv3"
     tasks: tuple[str, ...] = ()
     """as many as are named; the usual ones of the experiment if none"""
     seeds: tuple[int, ...] = (0, 1, 2)

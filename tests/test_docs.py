@@ -16,8 +16,8 @@ import pytest
 import scipy.special
 import tiny
 
-from vawm import envs, presets
-from vawm.agent import make_agent
+from vawm import envs
+from vawm.agent import make_agent, registry
 from vawm.cli import command_line, flags
 from vawm.envs import probes
 from vawm.policy import policy as policy_lib
@@ -72,7 +72,7 @@ def prose(text):
 
 
 def configs():
-    for of_suite in presets.PRESETS.values():
+    for of_suite in (registry.kind(name).presets for name in registry.names()):
         for of_name in of_suite.values():
             yield from of_name.values()
 

@@ -10,8 +10,9 @@ from __future__ import annotations
 import dataclasses
 import functools
 import typing
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 Network = Literal["dreamerv3", "storm"]
 """Hidden layers: with bias, RMSNorm, SiLU; or without bias, LayerNorm, ReLU."""
@@ -21,7 +22,7 @@ Bins = Literal["symexp", "symlog"]
 
 @dataclass(frozen=True)
 class WorldModelConfig:
-    """What all world models have."""
+    """What all world models have. A world model of your own derives its config from this."""
 
     deter: int
     """width of h"""
@@ -31,27 +32,39 @@ class WorldModelConfig:
     """classes of each categorical"""
     units: int
     """width of the hidden layers of encoder, decoder, reward and continue heads"""
-    depth: int
+    depth: int = 16
     """channels of the image encoder's first stage and the decoder's last, up to a factor"""
-    bins: int
+    bins: int = 255
     """bins of the two-hot reward"""
-    bin_spacing: Bins
+    bin_spacing: Bins = "symexp"
     """symexp: values spaced by symexp; symlog: evenly spaced symlogs, whose mean is decoded"""
-    unimix: float
+    unimix: float = 0.01
     """uniform share mixed into prior and posterior"""
-    free_nats: float
-    free_nats_of: Literal["state", "batch"]
+    free_nats: float = 1.0
+    free_nats_of: Literal["state", "batch"] = "state"
     """what has them: the KL of each state, or the mean over the batch, whose gradient then is 0
     for all states at once"""
-    continue_target: Literal["discounted", "plain"]
+    continue_target: Literal["discounted", "plain"] = "discounted"
     """what the continue head learns where an episode goes on: gamma, or 1"""
-    reconstruction_scale: float
-    dynamics_scale: float
-    representation_scale: float
+    reconstruction_scale: float = 1.0
+    dynamics_scale: float = 1.0
+    representation_scale: float = 0.1
 
 
 @dataclass(frozen=True)
-class RSSMConfig(WorldModelConfig):
+class HeadsConfig(WorldModelConfig):
+    """A world model with the encoder, decoder, reward and continue heads of DreamerV3."""
+
+    encoder_layers: int = 3
+    decoder_layers: int = 3
+    reward_layers: int = 1
+    continue_layers: int = 1
+    blocks: int = 8
+    """blocks of the layer that the image decoder starts with; of an RSSM also of its GRU"""
+
+
+@dataclass(frozen=True)
+class RSSMConfig(HeadsConfig):
     """RSSM of DreamerV3 with block GRU; widths default to size 12m."""
 
     deter: int = 2048
@@ -60,24 +73,9 @@ class RSSMConfig(WorldModelConfig):
     units: int = 256
     depth: int = 16
     """channels of the image encoder and decoder, whose stages have 2, 3, 4 and 4 times these"""
-    bins: int = 255
-    bin_spacing: Bins = "symexp"
-    unimix: float = 0.01
-    free_nats: float = 1.0
-    free_nats_of: Literal["state", "batch"] = "state"
-    continue_target: Literal["discounted", "plain"] = "discounted"
-    reconstruction_scale: float = 1.0
-    dynamics_scale: float = 1.0
-    representation_scale: float = 0.1
     hidden: int = 256
     """width of the layers around h"""
-    blocks: int = 8
-    """blocks of the block-diagonal GRU"""
     prior_layers: int = 2
-    encoder_layers: int = 3
-    decoder_layers: int = 3
-    reward_layers: int = 1
-    continue_layers: int = 1
     reconstruction_gradient: bool = True
     """whether reconstruction shapes the latents; else the decoder only shows what they hold"""
 
@@ -118,16 +116,11 @@ class StormConfig(WorldModelConfig):
     units: int = 512
     depth: int = 32
     """channels of the image encoder and decoder, whose stages have 1, 2, 4 and 8 times these"""
-    bins: int = 255
     bin_spacing: Bins = "symlog"
-    unimix: float = 0.01
-    free_nats: float = 1.0
     free_nats_of: Literal["state", "batch"] = "batch"
     """batch: the official code; state: as DreamerV3"""
     continue_target: Literal["discounted", "plain"] = "plain"
-    reconstruction_scale: float = 1.0
     dynamics_scale: float = 0.5
-    representation_scale: float = 0.1
     blocks: int = 2
     """transformer blocks"""
     heads: int = 8
@@ -379,19 +372,8 @@ ENV_CONFIGS: dict[str, type[EnvConfig]] = {
 """Suite -> what can be chosen of its environments."""
 
 
-class AgentConfigs(NamedTuple):
-    """What an agent takes in the place of `WorldModelConfig` and `OptimizerConfig`."""
-
-    world_model: type[WorldModelConfig]
-    optimizer: type[OptimizerConfig]
-
-
-AGENT_CONFIGS = {
-    "dreamerv3": AgentConfigs(RSSMConfig, LaPropConfig),
-    "storm": AgentConfigs(StormConfig, AdamConfig),
-    "vagram": AgentConfigs(VagramConfig, LaPropConfig),
-}
-"""Agent -> what can be chosen of it."""
+AgentName = Annotated[str, "a name in vawm.agent.registry"]
+"""Which agent: the programs offer those that are registered."""
 
 
 @dataclass(frozen=True)
@@ -401,13 +383,13 @@ class Config:
     suite: Literal["dmc_proprio", "dmc_vision", "atari100k", "gymnasium"] = "dmc_proprio"
     """where the task is from"""
     task: str = "cartpole_swingup"
-    agent: Literal["dreamerv3", "storm", "vagram"] = "dreamerv3"
-    """which world model imagines: a recurrent one, a transformer, or a recurrent one without
-    noise or likelihood"""
+    agent: AgentName = "dreamerv3"
+    """which world model imagines: the recurrent one of dreamerv3, the transformer of storm, the
+    deterministic one of vagram, or one that was registered"""
     preset: str = "paper"
-    """where the other numbers come from: an entry of `presets.PRESETS`, or custom"""
+    """where the other numbers come from: a preset of the agent in this suite, or custom"""
     size: str = "12m"
-    """whose widths these are: an entry of `SIZES`, or custom"""
+    """whose widths these are: a size of the agent, or custom"""
     seed: int = 0
     env_steps: int = 500_000
     num_envs: int = 16
@@ -444,7 +426,7 @@ class Config:
 
 
 CUSTOM = "custom"
-"""the preset or size of a run that none of `presets.PRESETS` or `SIZES` describes"""
+"""the preset or size of a run that has numbers of its own"""
 
 
 class RSSMSize(NamedTuple):
@@ -478,26 +460,26 @@ RSSM_SIZES = {
     "400m": RSSMSize(deter=12288, hidden=1536, classes=96, units=1536, depth=96),
 }
 
-SIZES: dict[str, dict[str, RSSMSize] | dict[str, StormSize]] = {
-    "dreamerv3": RSSM_SIZES,
-    "storm": {
-        "1m": StormSize(deter=128, feedforward=256, heads=4, classes=8, units=128, depth=8),
-        "16m": StormSize(deter=512, feedforward=1024, heads=8, classes=32, units=512, depth=32),
-    },
-    "vagram": RSSM_SIZES,
+STORM_SIZES = {
+    "1m": StormSize(deter=128, feedforward=256, heads=4, classes=8, units=128, depth=8),
+    "16m": StormSize(deter=512, feedforward=1024, heads=8, classes=32, units=512, depth=32),
 }
-"""Agent -> name -> widths. STORM's official size is 16m, named after its world model."""
+"""The official size is 16m, named after its world model."""
 
 
-def with_size(config: Config, size: str) -> Config:
-    """`config` with the widths of `SIZES[config.agent][size]`."""
-    widths = SIZES[config.agent][size]._asdict()
+def with_widths(config: Config, size: str, widths: Mapping[str, int]) -> Config:
+    """`config` with these widths of the world model, whose size they are.
+
+    Actor and critic get the world model's `units`, where that is among them.
+    """
+    changed: dict[str, Any] = dict(widths)
+    units = {"units": changed["units"]} if "units" in changed else {}
     return dataclasses.replace(
         config,
         size=size,
-        world_model=dataclasses.replace(config.world_model, **widths),
-        actor=dataclasses.replace(config.actor, units=widths["units"]),
-        critic=dataclasses.replace(config.critic, units=widths["units"]),
+        world_model=dataclasses.replace(config.world_model, **changed),
+        actor=dataclasses.replace(config.actor, **units),
+        critic=dataclasses.replace(config.critic, **units),
     )
 
 

@@ -1,4 +1,7 @@
-"""Values of `Config` by agent, suite and name: the paper's, and small ones for a CPU."""
+"""Values of `Config` by agent, suite and name: the paper's, and small ones for a CPU.
+
+Programs look them up in `vawm.agent.registry`.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,8 @@ import dataclasses
 from typing import Any
 
 from vawm.config import (
-    SIZES,
+    RSSM_SIZES,
+    STORM_SIZES,
     ActorConfig,
     AdamConfig,
     AtariConfig,
@@ -17,19 +21,18 @@ from vawm.config import (
     ImaginationConfig,
     LaPropConfig,
     ReplayConfig,
-    RSSMConfig,
     StormConfig,
     VagramConfig,
     ValueAlignmentConfig,
     VideoConfig,
     VisionConfig,
-    with_size,
+    with_widths,
 )
 
 PAPER = Config()
 
 QUICK = dataclasses.replace(
-    with_size(PAPER, "1m"),
+    with_widths(PAPER, "1m", RSSM_SIZES["1m"]._asdict()),
     preset="quick",
     env_steps=120_000,
     num_envs=8,
@@ -164,7 +167,7 @@ STORM = Config(
 are random; one update of everything for each. Table 14, and what it leaves out."""
 
 STORM_QUICK = dataclasses.replace(
-    with_size(STORM, "1m"),
+    with_widths(STORM, "1m", STORM_SIZES["1m"]._asdict()),
     suite="dmc_proprio",
     task="cartpole_swingup",
     preset="quick",
@@ -197,47 +200,39 @@ def small_storm(like: Config) -> Config:
 
 def vagram(like: Config) -> Config:
     """A deterministic world model and VaGraM, in the run that `like` is for DreamerV3."""
-    assert isinstance(like.world_model, RSSMConfig)
-    widths = SIZES["vagram"][like.size]._asdict()
     return dataclasses.replace(
         like,
         agent="vagram",
-        world_model=VagramConfig(**widths),
+        world_model=VagramConfig(**RSSM_SIZES[like.size]._asdict()),
         value_alignment=dataclasses.replace(like.value_alignment, weight="off"),
     )
 
 
-PRESETS: dict[str, dict[str, dict[str, Config]]] = {
-    "dreamerv3": {
-        "dmc_proprio": {"quick": QUICK, "paper": PAPER},
-        "dmc_vision": {"quick": VISION_QUICK, "paper": VISION_PAPER},
-        "atari100k": {"quick": ATARI_QUICK, "paper": ATARI_PAPER},
-        "gymnasium": {"quick": GYMNASIUM_QUICK, "pixels": GYMNASIUM_PIXELS},
+DREAMERV3 = {
+    "dmc_proprio": {"quick": QUICK, "paper": PAPER},
+    "dmc_vision": {"quick": VISION_QUICK, "paper": VISION_PAPER},
+    "atari100k": {"quick": ATARI_QUICK, "paper": ATARI_PAPER},
+    "gymnasium": {"quick": GYMNASIUM_QUICK, "pixels": GYMNASIUM_PIXELS},
+}
+"""Suite -> name -> config."""
+
+STORM_PRESETS = {
+    "dmc_proprio": {"quick": STORM_QUICK},
+    "dmc_vision": {"quick": small_storm(VISION_QUICK)},
+    "atari100k": {
+        "quick": dataclasses.replace(small_storm(ATARI_QUICK), env=STORM.env),
+        "paper": STORM,
     },
-    "storm": {
-        "dmc_proprio": {"quick": STORM_QUICK},
-        "dmc_vision": {"quick": small_storm(VISION_QUICK)},
-        "atari100k": {
-            "quick": dataclasses.replace(small_storm(ATARI_QUICK), env=STORM.env),
-            "paper": STORM,
-        },
-        "gymnasium": {
-            "quick": small_storm(GYMNASIUM_QUICK),
-            "pixels": dataclasses.replace(
-                small_storm(GYMNASIUM_PIXELS),
-                actor=dataclasses.replace(STORM_QUICK.actor, unimix=0.01, entropy_scale=3e-3),
-            ),
-        },
+    "gymnasium": {
+        "quick": small_storm(GYMNASIUM_QUICK),
+        "pixels": dataclasses.replace(
+            small_storm(GYMNASIUM_PIXELS),
+            actor=dataclasses.replace(STORM_QUICK.actor, unimix=0.01, entropy_scale=3e-3),
+        ),
     },
 }
-"""Agent -> suite -> name -> config."""
 
-PRESETS["vagram"] = {
+VAGRAM_PRESETS = {
     suite: {name: vagram(config) for name, config in named.items()}
-    for suite, named in PRESETS["dreamerv3"].items()
+    for suite, named in DREAMERV3.items()
 }
-
-
-def of(config: Config) -> dict[str, Config]:
-    """The presets of this agent in this suite, by name."""
-    return PRESETS[config.agent][config.suite]

@@ -24,7 +24,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from vawm import config as config_lib
+from vawm.agent import registry
 from vawm.cli import command_line, flags
 from vawm.errors import InvalidInput
 from vawm.sweep import ablation
@@ -64,7 +64,7 @@ def crossed(agent: str, flag: str, sizes: Sequence[str]) -> tuple[Variant, ...]:
 MODEL = ablation.Ablation(
     name="capacity_model",
     title="Model size, value alignment and VaGraM (Fig. 2a).",
-    variants=lambda agent: crossed(agent, "--size", list(config_lib.SIZES[agent])[:3]),
+    variants=lambda agent: crossed(agent, "--size", list(registry.kind(agent).sizes)[:3]),
     quick=ablation.QUICK._replace(
         tasks=("cartpole_balance",), seeds=(0,), env_steps=8_000, flags=FEW_STATES
     ),

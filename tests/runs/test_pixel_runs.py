@@ -12,6 +12,7 @@ import tiny_storm
 
 from vawm import config as config_lib
 from vawm import evaluate, presets
+from vawm.agent import registry
 from vawm.envs.host import rendering
 from vawm.policy import policy
 from vawm.runs import runner, suites
@@ -43,7 +44,7 @@ def tiny_version(config, steps=STEPS, **changes):
     )
 
 
-STORM = presets.PRESETS["storm"]["atari100k"]["quick"]
+STORM = registry.kind("storm").presets["atari100k"]["quick"]
 CONFIGS = {
     "atari100k": tiny_version(presets.ATARI_QUICK, task="breakout"),
     "dmc_vision": tiny_version(

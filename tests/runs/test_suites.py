@@ -8,6 +8,7 @@ import pathlib
 import pytest
 
 from vawm import presets
+from vawm.agent import registry
 from vawm.cli import command_line
 from vawm.errors import InvalidInput
 from vawm.process import cache
@@ -48,18 +49,18 @@ def experiment(monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize("suite", PROGRAMS)
-@pytest.mark.parametrize("agent", presets.PRESETS)
+@pytest.mark.parametrize("agent", registry.names())
 def test_every_program_runs_its_suite_and_says_what_its_preset_is(
     experiment, suite, agent, capsys
 ):
     assert experiment(suite, *([] if agent == "dreamerv3" else ["--agent", agent])) == 0
     config, logdir = experiment.seen[0]
-    assert config == presets.PRESETS[agent][suite]["quick"]
+    assert config == registry.kind(agent).presets[suite]["quick"]
     assert logdir.parts[:2] == ("runs", suite)
     text = capsys.readouterr().out
     assert f"{agent}, preset quick: {suite} {config.task}, " in text
     assert "for a CPU with 2 cores; this is not the paper's setting" in text
-    assert ("--preset paper" in text) == ("paper" in presets.PRESETS[agent][suite])
+    assert ("--preset paper" in text) == ("paper" in registry.kind(agent).presets[suite])
 
 
 @pytest.mark.parametrize("flag", [["--game", "krull"], ["--game=krull"], ["--task", "krull"]])

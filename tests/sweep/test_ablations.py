@@ -8,8 +8,7 @@ import sys
 
 import pytest
 
-from vawm import config as config_lib
-from vawm import presets
+from vawm.agent import registry
 from vawm.cli import command_line
 from vawm.errors import InvalidInput
 from vawm.sweep import ablation, children, overhead, runs
@@ -38,7 +37,7 @@ ABLATIONS = {
 def possible(name, scale, agent):
     """Whether the agent has the presets of the scale, and what the ablation is about."""
     chosen = getattr(ABLATIONS[name], scale)
-    config = presets.PRESETS[agent].get(chosen.suite, {}).get(chosen.preset)
+    config = registry.kind(agent).presets.get(chosen.suite, {}).get(chosen.preset)
     if config is None:
         return False
     if agent == "vagram" and (name == "noise" or name.startswith("capacity")):
@@ -73,7 +72,7 @@ def test_where_nothing_was_measured_what_is_written_stays(tmp_path, capsys):
     assert written.read_text() == "a table"
 
 
-@pytest.mark.parametrize("agent", config_lib.AGENT_CONFIGS)
+@pytest.mark.parametrize("agent", registry.names())
 @pytest.mark.parametrize("scale", ["quick", "paper"])
 @pytest.mark.parametrize("name", ABLATIONS)
 def test_every_variant_is_one_that_starts(name, scale, agent):

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from vawm.agent import registry
 from vawm.agent.actor_critic import Actor, Critic, make_actor, make_critic
-from vawm.config import Config, RSSMConfig, StormConfig, VagramConfig
-from vawm.types import Array, EnvSpec, Key, Params, PyTree, TimeStep
+from vawm.config import Config
+from vawm.types import Array, EnvSpec, Inference, Key, Params, PyTree, TimeStep
 from vawm.world_model.protocol import WorldModel
-from vawm.world_model.rssm import rssm
-from vawm.world_model.storm import storm
 
 
 class PolicyCarry(NamedTuple):
@@ -22,6 +22,10 @@ class PolicyCarry(NamedTuple):
     action: Array  # [N, A], the raw action that left from the previous observation
 
 
+LatentLoss = Callable[[PyTree, PyTree, Inference], Array]
+"""`(critic_params, slow_critic_params, inference) -> [B, T]`, one more loss of its model."""
+
+
 class Agent(NamedTuple):
     """Pure functions of parameters; holds no arrays but constants."""
 
@@ -29,6 +33,7 @@ class Agent(NamedTuple):
     world_model: WorldModel
     actor: Actor
     critic: Critic
+    latent_loss: LatentLoss | None = None
 
     def init(self, key: Key) -> tuple[Params, PyTree]:
         """Fresh parameters, and the state of the world model beside them."""
@@ -103,22 +108,24 @@ def resolve_dtype(compute_dtype: str) -> jnp.dtype:
 
 
 def make_agent(config: Config, spec: EnvSpec) -> Agent:
-    """The agent that `config` describes, for environments of `spec`."""
+    """The agent that `config` describes, for environments of `spec`.
+
+    Raises:
+      UnknownAgent: nothing has registered `config.agent`.
+    """
     dtype = resolve_dtype(config.compute_dtype)
-    model, noise = config.world_model, config.value_alignment.noise
+    row, model = registry.kind(config.agent), config.world_model
     feature_size = model.deter + model.stoch * model.classes
-    if isinstance(model, StormConfig):
-        world_model = storm(model, spec, dtype=dtype, noise=noise)
-    elif isinstance(model, RSSMConfig):
-        deterministic = isinstance(model, VagramConfig)
-        world_model = rssm(model, spec, dtype=dtype, noise=noise, deterministic=deterministic)
-    else:
-        raise TypeError(f"no world model for {type(model).__name__}")
+    critic = make_critic(config.critic, feature_size, dtype)
+    latent_loss = None
+    if row.make_latent_loss is not None:
+        latent_loss = row.make_latent_loss(critic, model)
     return Agent(
         spec=spec,
-        world_model=world_model,
+        world_model=row.make(model, spec, dtype=dtype, noise=config.value_alignment.noise),
         actor=make_actor(config.actor, spec, feature_size, dtype),
-        critic=make_critic(config.critic, feature_size, dtype),
+        critic=critic,
+        latent_loss=latent_loss,
     )
 
 

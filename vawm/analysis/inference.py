@@ -14,9 +14,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from vawm.agent import Agent
+from vawm.agent import Agent, registry
 from vawm.analysis.episodes import Episodes, windows
-from vawm.config import Config, StormConfig
+from vawm.config import Config
 from vawm.envs.protocol import check_positive
 from vawm.errors import InvalidInput
 from vawm.types import Array, Batch, Key, Latent, Params, PyTree, Trajectory
@@ -119,7 +119,7 @@ def check(config: Config, *, context: int, depth: int) -> None:
     if context < 2:
         raise InvalidInput("context", context, "use at least 2: the first step infers nothing")
     seen = config.replay.batch_length
-    if not isinstance(config.world_model, StormConfig) or context + depth <= seen:
+    if not registry.kind(config.agent).context_limited or context + depth <= seen:
         return
     saw = f"training saw {seen} positions"
     if context >= seen:

@@ -18,10 +18,9 @@ from typing import Annotated, NamedTuple
 
 import tyro
 
-from vawm import config as config_lib
-from vawm import presets
+from vawm.agent import registry
 from vawm.cli import flags as flags_lib
-from vawm.config import Config
+from vawm.config import CUSTOM, Config
 from vawm.envs.protocol import EnvironmentFailure
 from vawm.errors import InvalidInput
 from vawm.process import cache, streams
@@ -130,7 +129,7 @@ def _defaults(argv: list[str], suite: str, preset: str) -> Config:
     except argparse.ArgumentError:  # --resume=value
         raise InvalidInput("--resume", True, "takes no value; write --resume alone") from None
     if not known.resume or {"-h", "--help"} & set(argv):
-        size = None if known.size == config_lib.CUSTOM else known.size
+        size = None if known.size == CUSTOM else known.size
         agent = known.agent or "dreamerv3"
         config = validate.preset(agent, suite, known.preset or preset, size)
         return _with_its_warmup(config, known.env_steps)
@@ -138,11 +137,11 @@ def _defaults(argv: list[str], suite: str, preset: str) -> Config:
         raise InvalidInput("logdir", None, "--resume needs the --logdir of the run")
     saved = resume.saved_config(known.logdir)
     if known.agent not in (None, saved.agent):  # whose choices are others: refused here
-        validate.check_choice("agent", known.agent, config_lib.AGENT_CONFIGS)
+        validate.check_choice("agent", known.agent, registry.names())
         resume.check(known.logdir, dataclasses.replace(saved, agent=known.agent))
-    if known.size not in (None, saved.size, config_lib.CUSTOM):
-        validate.check_choice("size", known.size, config_lib.SIZES[saved.agent])
-        return config_lib.with_size(saved, known.size)
+    if known.size not in (None, saved.size, CUSTOM):
+        validate.check_choice("size", known.size, registry.kind(saved.agent).sizes)
+        return registry.with_size(saved, known.size)
     return saved
 
 
@@ -161,23 +160,22 @@ def _with_its_warmup(config: Config, env_steps: str | None) -> Config:
 
 def is_small(config: Config) -> bool:
     """Whether this run is of a preset for a CPU: any but that of the paper."""
-    return config.preset != "paper" and config.preset in presets.of(config)
+    return config.preset != "paper" and config.preset in registry.presets_of(config)
 
 
 def scaled_warmup(config: Config, env_steps: int) -> int:
     """The warm-up of a small preset, in env steps, for another length: the same share."""
-    usual = presets.of(config)[config.preset]
+    usual = registry.presets_of(config)[config.preset]
     return usual.value_alignment.warmup_steps * env_steps // usual.env_steps
 
 
 def _with_its_size(config: Config) -> Config:
     """`config`; of size custom where a width is not the one of its size."""
     size = config.size
-    if size not in config_lib.SIZES[config.agent] or config == config_lib.with_size(
-        config, size
-    ):
+    sizes = registry.kind(config.agent).sizes
+    if size not in sizes or config == registry.with_size(config, size):
         return config
-    return dataclasses.replace(config, size=config_lib.CUSTOM)
+    return dataclasses.replace(config, size=CUSTOM)
 
 
 def default_logdir(config: Config) -> pathlib.Path:
@@ -193,7 +191,7 @@ def describe(config: Config) -> str:
         f"{config.agent}, preset {config.preset}: {config.suite} {config.task}, "
         f"{config.env_steps:,} env steps, size {config.size}, seed {config.seed}"
     )
-    alignment, paper = _describe_alignment(config), presets.of(config).get("paper")
+    alignment, paper = _describe_alignment(config), registry.presets_of(config).get("paper")
     if not is_small(config):
         return f"{head}\nvalue alignment: {alignment}"
     lines = [head, "  for a CPU with 2 cores; this is not the paper's setting"]
@@ -222,7 +220,7 @@ def _describe_alignment(config: Config) -> str:
     percent = 100 * (length - warmup) // length
     share = f"{about}{percent} %" if percent else "less than 1 %"
     text = f"active after {warmup:,} {unit}, for {share} of the run"
-    paper = presets.of(config).get("paper")
+    paper = registry.presets_of(config).get("paper")
     if paper is None or not is_small(config) or config.env_steps >= paper.env_steps:
         return text
     if not in_updates and warmup == scaled_warmup(config, config.env_steps):

@@ -1,20 +1,25 @@
-"""Flags from a dataclass, by tyro, with one line per error instead of its box."""
+"""Flags from a dataclass, by tyro, with one line per error instead of its box.
+
+Every program also takes `--plugin FILE_OR_MODULE ...`, which registers further agents, see
+`vawm.agent.plugins`; a field that is an `AgentName` offers all that are registered.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
-import difflib
 import io
 import re
 import sys
 import typing
 from collections.abc import Sequence
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import tyro
 
-from vawm.errors import InvalidInput
+from vawm.agent import plugins, registry
+from vawm.config import AgentName, Config
+from vawm.errors import InvalidInput, suggestion
 
 T = TypeVar("T")
 
@@ -34,21 +39,75 @@ def read(
       InvalidInput: names the flag, its value and the remedy.
       SystemExit: help was asked for (0).
     """
-    argv = list(sys.argv[1:] if argv is None else argv)
-    given: Any = {} if default is None else {"default": default}
+    argv = load_plugins(list(sys.argv[1:] if argv is None else argv))
+    offered = _offering(cls, default)
+    start = None if default is None else _recast(default, offered)
+    given: Any = {} if start is None else {"default": start}
     box = io.StringIO()
     try:
         with contextlib.redirect_stderr(box):
             result, unknown = tyro.cli(
-                cls, args=argv, description=description, return_unknown_args=True, **given
+                offered, args=argv, description=description, return_unknown_args=True, **given
             )
     except SystemExit as error:
         if not error.code:
             raise
-        raise _bad_value(box.getvalue(), argv, known(cls, default)) from None
+        raise _bad_value(box.getvalue(), argv, known(offered, start)) from None
     if unknown:
-        raise _unknown(unknown, known(cls, default))
-    return result
+        raise _unknown(unknown, known(offered, start))
+    return _recast(result, cls)
+
+
+def load_plugins(argv: list[str]) -> list[str]:
+    """`argv` without `--plugin` and the words after it, which are imported.
+
+    Raises:
+      InvalidInput: no word follows, or one cannot be imported.
+    """
+    left: list[str] = []
+    named: list[str] | None = None
+    for word in argv:
+        flag, has_value, value = word.partition("=")
+        if flag == "--plugin":
+            named = (named or []) + ([value] if has_value else [])
+            taking = not has_value
+        elif named is not None and taking and not word.startswith("--"):
+            named.append(word)
+        else:
+            taking = False
+            left.append(word)
+    if named == []:
+        raise InvalidInput(
+            "--plugin", None, "has no value; name a module, or a file like own.py"
+        )
+    if named:
+        plugins.add(named)
+    return left
+
+
+def _offering(cls: type, default: Any) -> type:
+    """`cls`, where a field that is an `AgentName` is one of the agents that are registered."""
+    changed: list[tuple[str, Any]] = []
+    hints = typing.get_type_hints(cls, include_extras=True)
+    for field in dataclasses.fields(cls):
+        hint, value = hints[field.name], getattr(default, field.name, None)
+        if hint == AgentName:
+            changed.append((field.name, typing.Literal[registry.names()]))
+        elif field.name == "config":
+            inner = _offering(Config, value)
+            changed.append((field.name, Annotated[(inner, *typing.get_args(hint)[1:])]))
+    if not changed:
+        return cls
+    return dataclasses.make_dataclass(cls.__name__, changed, bases=(cls,), frozen=True)
+
+
+def _recast(value: Any, cls: type) -> Any:
+    """A dataclass with the same fields as a `cls`, its config too."""
+    parts = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    kinds = typing.get_type_hints(cls)
+    if "config" in parts:
+        parts["config"] = _recast(parts["config"], kinds["config"])
+    return cls(**parts)
 
 
 def known(cls: type, default: Any = None, prefix: str = "") -> dict[str, Any]:
@@ -86,8 +145,7 @@ def _unknown(words: list[str], flags: dict[str, Any]) -> InvalidInput:
         remedy = "belongs to no flag; write --flag value (--help lists the flags)"
         return InvalidInput("argument", words[0], remedy)
     flag, values = first.partition("=")[0], _values(first.partition("=")[0], words)
-    close = difflib.get_close_matches(_dashed(flag), flags, n=1)
-    guess = f"did you mean {close[0]}? " if close else ""
+    guess = suggestion(_dashed(flag), flags)
     value = " ".join(values) if values else None
     return InvalidInput(flag, value, f"no such flag; {guess}--help lists all")
 
@@ -122,8 +180,6 @@ def _values(flag: str, words: list[str]) -> list[str] | None:
 def _remedy(value: str | None, kind: Any) -> str:
     if typing.get_origin(kind) is typing.Literal:
         names = [str(choice) for choice in typing.get_args(kind)]
-        close = difflib.get_close_matches(value or "", names, n=1)
-        guess = f"did you mean {close[0]!r}? " if close else ""
-        return f"{guess}use one of {', '.join(names)}"
+        return f"{suggestion(value or '', names)}use one of {', '.join(names)}"
     wanted = [KINDS[k] for k in (kind, *typing.get_args(kind)) if k in KINDS]
     return f"use {wanted[0]}" if wanted else "--help tells what it takes"

@@ -22,8 +22,7 @@ import jax.numpy as jnp
 from vawm import losses
 from vawm.agent import Agent
 from vawm.agent.imagination import imagine
-from vawm.config import Config, VagramConfig
-from vawm.learning.value_gradient import make_value_gradient_loss
+from vawm.config import Config
 from vawm.losses import returns, transforms
 from vawm.types import Array, Batch, Inference, Key, Latent, Metrics, Params, PyTree, Trajectory
 
@@ -92,9 +91,6 @@ def make_world_model_loss(agent: Agent, config: Config):
     """
     model = config.world_model
     value_alignment = make_value_alignment(agent, config)
-    vagram = None
-    if isinstance(model, VagramConfig):
-        vagram = make_value_gradient_loss(agent, model)
     reward_code = transforms.make_two_hot(model.bins, model.bin_spacing)
     discount = 1.0 if model.continue_target == "plain" else discount_of(config)
     of_batch = model.free_nats_of == "batch"
@@ -140,8 +136,10 @@ def make_world_model_loss(agent: Agent, config: Config):
             "loss/continue": prediction.cont,
             "loss/dynamics": dynamics,
         }
-        if vagram:
-            parts["loss/value_gradient"] = vagram(params.critic, slow_critic, inference)
+        if agent.latent_loss is not None:
+            parts["loss/value_gradient"] = agent.latent_loss(
+                params.critic, slow_critic, inference
+            )
         parts = {name: jnp.mean(part) for name, part in parts.items()}
         loss_var = {"loss/value_alignment": jnp.mean(aligned.weight * aligned.loss)}
         if config.value_alignment.weight != "off":

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import math
 import pathlib
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import jax
 
-from vawm import nets
-from vawm.config import Config, HostEnvConfig, RSSMConfig, StormConfig, VisionConfig
+from vawm.agent import registry
+from vawm.agent.registry import Activations
+from vawm.config import Config, HostEnvConfig, VisionConfig
 from vawm.envs.host.crew import cores
 from vawm.errors import InvalidInput
 from vawm.runs.checkpoint.manifest import leaf_info
-from vawm.types import EnvSpec, PyTree, is_image
+from vawm.types import ArraySpec, EnvSpec, PyTree, is_image
 
 CGROUP_LIMITS = [
     (
@@ -152,73 +154,44 @@ def working_bytes(spec: EnvSpec, config: Config) -> int:
     per imagined state (features, actor, critic and its logits), `WORKING_FACTOR` times, and
     the maps of images, `IMAGE_FACTOR` times.
     """
-    model, critic, steps = config.world_model, config.critic, config.replay.batch_steps
+    model, imagination = config.world_model, config.imagination
+    steps = config.replay.batch_steps
+    row = registry.kind(config.agent).activations(config, _image_size(spec))
     feature = model.deter + model.stoch * model.classes
-    imagined = 2 * feature + config.actor.layers * config.actor.units + 4 * critic.bins
-    states = steps * (config.imagination.horizon + 1)
-    if isinstance(model, StormConfig):
-        observed, cache = _storm_step(model, config), _storm_cache(model, config)
-        states = config.imagination.batch_size * (config.imagination.horizon + 1)
-    else:
-        assert isinstance(model, RSSMConfig)
-        observed, cache = 8 * feature + 4 * _rssm_step(model, config), 0
-    numbers = steps * observed + states * imagined
-    maps = max(steps * _image_maps(spec, config), _context_maps(spec, config))
-    return 4 * (WORKING_FACTOR * numbers + cache + IMAGE_FACTOR * maps)
+    imagined = 2 * feature + config.actor.layers * config.actor.units + 4 * config.critic.bins
+    starts = imagination.batch_size if imagination.starts == "contexts" else steps
+    states = starts * (imagination.horizon + 1)
+    numbers = steps * row.observed + states * imagined
+    maps = _image_maps(spec, row)
+    maps = max(steps * maps, _context_maps(config, maps))
+    return 4 * (WORKING_FACTOR * numbers + row.cache + IMAGE_FACTOR * maps)
 
 
-def _rssm_step(model: RSSMConfig, config: Config) -> int:
-    """Numbers in the layers around h, for one step of a batch."""
-    layers = (
-        model.encoder_layers
-        + model.decoder_layers
-        + model.reward_layers
-        + model.continue_layers
-        + config.actor.layers
-        + config.critic.layers
-    )
-    return layers * model.units + model.bins + 3 * config.critic.bins
+def _images(spec: EnvSpec) -> list[ArraySpec]:
+    return [leaf for leaf in jax.tree.leaves(spec.obs) if is_image(leaf)]
 
 
-def _storm_step(model: StormConfig, config: Config) -> int:
-    """Numbers in the transformer and the heads, for one step of a batch."""
-    attention = 2 * model.heads * config.replay.batch_length
-    block = 8 * model.deter + 2 * model.feedforward + attention
-    layers = 2 * model.head_layers + 2 * model.vector_layers + 2 * config.critic.layers
-    flat = model.stoch * model.classes
-    return model.blocks * block + 8 * flat + layers * model.units + 4 * config.critic.bins
+def _image_size(spec: EnvSpec) -> int | None:
+    """Pixels a side of the images; None where there are none."""
+    images = _images(spec)
+    return images[0].shape[0] if images else None
 
 
-def _storm_cache(model: StormConfig, config: Config) -> int:
-    """Numbers in the keys and values of imagination."""
-    imagination = config.imagination
-    slots = imagination.context_length + imagination.horizon
-    return 4 * model.blocks * imagination.batch_size * slots * model.deter
+def _image_maps(spec: EnvSpec, row: Activations) -> int:
+    """Numbers in the maps of encoder and decoder for the images of one step.
+
+    They are those between the layers, and the images that are read and predicted.
+    """
+    return row.maps + sum(2 * math.prod(image.shape) for image in _images(spec))
 
 
-def _image_maps(spec: EnvSpec, config: Config) -> int:
-    """Numbers in the maps of encoder and decoder for one observation's images."""
-    images = [leaf for leaf in jax.tree.leaves(spec.obs) if is_image(leaf)]
-    if not images:
-        return 0
-    size, channels = images[0].shape[0], sum(image.shape[2] for image in images)
-    numbers = 2 * size * size * channels  # what is read, and what is predicted
-    # DreamerV3 halves after it has made a stage's channels, STORM's strides before.
-    strides = isinstance(config.world_model, StormConfig)
-    widths = nets.STRIDED_WIDTHS if strides else nets.STAGE_WIDTHS
-    for stage, width in enumerate(widths):
-        side = size // 2 ** (stage + strides)
-        numbers += 2 * side * side * width * config.world_model.depth
-    return numbers
-
-
-def _context_maps(spec: EnvSpec, config: Config) -> int:
+def _context_maps(config: Config, maps: int) -> int:
     """The same in the encoder's maps of the contexts; a CPU has those of a few at a time."""
     imagination = config.imagination
     if imagination.starts != "contexts" or jax.default_backend() == "cpu":
         return 0
     contexts = imagination.batch_size * imagination.context_length
-    return contexts * _image_maps(spec, config) // (2 * IMAGE_FACTOR)  # kept once, no gradient
+    return contexts * maps // (2 * IMAGE_FACTOR)  # kept once, no gradient
 
 
 def available() -> dict[str, int | None]:

@@ -3,38 +3,36 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import math
 import re
 import typing
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
 import jax
 
-from vawm import config as config_lib
 from vawm import presets
-from vawm.config import AtariConfig, Config, RSSMConfig, StormConfig, VisionConfig
+from vawm.agent import registry
+from vawm.config import CUSTOM, ENV_CONFIGS, AtariConfig, Config, VisionConfig, kinds
 from vawm.envs import EPISODE_STEPS
 from vawm.envs.host.frames import check_smaller
-from vawm.errors import InvalidInput
+from vawm.errors import (
+    ABOVE_ONE,
+    BELOW_ONE,
+    BINS,
+    CLASSES,
+    LAYERS,
+    NOT_NEGATIVE,
+    POSITIVE,
+    RATE,
+    SEQUENCE,
+    SHARE,
+    InvalidInput,
+    Rule,
+    suggestion,
+)
 from vawm.types import EnvSpec, is_image
 from vawm.world_model.codecs import check_image_size
-
-Rule = tuple[Callable[[Any], bool], str]
-
-POSITIVE: Rule = (lambda x: x > 0, "use a number above 0")
-NOT_NEGATIVE: Rule = (lambda x: x >= 0, "use 0 or a number above")
-SHARE: Rule = (lambda x: 0 <= x <= 1, "use a number from 0 to 1")
-BELOW_ONE: Rule = (lambda x: 0 <= x < 1, "use a number from 0 up to, not including, 1")
-RATE: Rule = (lambda x: 0 < x <= 1, "use a number above 0 and up to 1")
-ABOVE_ONE: Rule = (lambda x: x > 1, "use a number above 1")
-BINS: Rule = (lambda x: x >= 3 and x % 2 == 1, "use an odd number of at least 3")
-SEQUENCE: Rule = (lambda x: x >= 2, "use a number of at least 2")
-CLASSES: Rule = (lambda x: 2 <= x <= 256, "use a number from 2 to 256")
-# Each layer, and each block of a transformer, is built and compiled on its own: a million would
-# take the machine's memory.
-LAYERS: Rule = (lambda x: 1 <= x <= 100, "use a number from 1 to 100")
 
 RULES: dict[str, Rule] = {
     "seed": (lambda x: 0 <= x < 2**32, "use a number from 0 to 4294967295"),
@@ -47,16 +45,6 @@ RULES: dict[str, Rule] = {
     "world_model.reconstruction_scale": NOT_NEGATIVE,
     "world_model.dynamics_scale": NOT_NEGATIVE,
     "world_model.representation_scale": NOT_NEGATIVE,
-    "world_model.value_gradient_scale": NOT_NEGATIVE,
-    "world_model.dropout": BELOW_ONE,
-    "world_model.blocks": LAYERS,
-    "world_model.prior_layers": LAYERS,
-    "world_model.encoder_layers": LAYERS,
-    "world_model.decoder_layers": LAYERS,
-    "world_model.reward_layers": LAYERS,
-    "world_model.continue_layers": LAYERS,
-    "world_model.vector_layers": LAYERS,
-    "world_model.head_layers": LAYERS,
     "actor.layers": LAYERS,
     "critic.layers": LAYERS,
     "actor.unimix": BELOW_ONE,
@@ -89,7 +77,7 @@ RULES: dict[str, Rule] = {
     "video.every": NOT_NEGATIVE,
     "save_minutes": NOT_NEGATIVE,
 }
-"""Every other number has to be positive."""
+"""Field -> what its number must be. Agents add rules; all others must be positive."""
 
 KINDS = {bool: "True or False", str: "a text"}
 INT32 = 2**31  # whole numbers are counted with on the device, all but the seed
@@ -101,11 +89,14 @@ def check(config: Config) -> None:
     Raises:
       InvalidInput: names the first field that cannot work, its value and the remedy.
     """
+    check_choice("agent", config.agent, registry.names())
+    own = registry.kind(config.agent).rules
+    rules = RULES | {f"world_model.{name}": rule for name, rule in own.items()}
     for name, value, kind in fields(config):
         if typing.get_origin(kind) is typing.Literal:
             check_choice(name, value, typing.get_args(kind))
         elif kind in (int, float):
-            _check_number(name, value, kind)
+            _check_number(name, value, kind, rules)
         elif isinstance(kind, type) and not isinstance(value, kind):
             raise InvalidInput(name, value, f"use {KINDS.get(kind, kind.__name__)}")
     _check_together(config)
@@ -115,8 +106,7 @@ def check_choice(name: str, value: Any, choices: Collection[str]) -> None:
     """Refuses what is not among `choices`, and suggests the nearest."""
     if value in choices:
         return
-    close = difflib.get_close_matches(str(value), choices, n=1)
-    guess = f"did you mean {close[0]!r}? " if close else ""
+    guess = suggestion(value, choices)
     raise InvalidInput(name, value, f"{guess}use one of {', '.join(choices)}")
 
 
@@ -129,7 +119,7 @@ def values(config: Config) -> Iterator[tuple[str, Any]]:
 def fields(node: Any, prefix: str = "") -> Iterator[tuple[str, Any, Any]]:
     """(dotted name, value, type) of every field that holds no further fields."""
     kind: type = type(node)
-    hints = config_lib.kinds(kind)
+    hints = kinds(kind)
     for field in dataclasses.fields(node):
         name, value = prefix + field.name, getattr(node, field.name)
         if dataclasses.is_dataclass(value):
@@ -138,13 +128,13 @@ def fields(node: Any, prefix: str = "") -> Iterator[tuple[str, Any, Any]]:
             yield name, value, hints[field.name]
 
 
-def _check_number(name: str, value: Any, kind: type) -> None:
+def _check_number(name: str, value: Any, kind: type, rules: Mapping[str, Rule]) -> None:
     number = isinstance(value, int if kind is int else int | float)
     if isinstance(value, bool) or not number:
         raise InvalidInput(name, value, f"use a {'whole ' if kind is int else ''}number")
     if not math.isfinite(value):
         raise InvalidInput(name, value, "use a finite number")
-    holds, remedy = RULES.get(name, POSITIVE)
+    holds, remedy = rules.get(name, POSITIVE)
     if not holds(value):
         raise InvalidInput(name, value, remedy)
     if isinstance(value, int) and value >= INT32 and name != "seed":
@@ -156,8 +146,8 @@ def _check_together(config: Config) -> None:
     _check_agent(config)
     _check_names(config)
     _check_project(config.tracker_project)
-    _check_widths(config)
     _check_imagination(config)
+    registry.kind(config.agent).check(config)
     _check_replay(config)
     _check_counters(config)
     _check_env(config)
@@ -172,7 +162,8 @@ def _check_together(config: Config) -> None:
 
 def _check_agent(config: Config) -> None:
     """An agent has the choices of its own kind."""
-    for name, kind in config_lib.AGENT_CONFIGS[config.agent]._asdict().items():
+    row = registry.kind(config.agent)
+    for name, kind in (("world_model", row.world_model), ("optimizer", row.optimizer)):
         if type(getattr(config, name)) is not kind:
             remedy = f"agent {config.agent} takes a {kind.__name__}"
             raise InvalidInput(name, type(getattr(config, name)).__name__, remedy)
@@ -180,17 +171,16 @@ def _check_agent(config: Config) -> None:
 
 def _check_names(config: Config) -> None:
     """Preset and size are known, and a size is not the name of other widths than its own."""
-    check_choice("preset", config.preset, [*presets.of(config), config_lib.CUSTOM])
-    sizes = config_lib.SIZES[config.agent]
-    check_choice("size", config.size, [*sizes, config_lib.CUSTOM])
-    if config.size == config_lib.CUSTOM:
+    check_choice("preset", config.preset, [*registry.presets_of(config), CUSTOM])
+    check_choice("size", config.size, [*registry.kind(config.agent).sizes, CUSTOM])
+    if config.size == CUSTOM:
         return
-    widths = dict(values(config_lib.with_size(config, config.size)))
+    widths = dict(values(registry.with_size(config, config.size)))
     for name, value in values(config):
         if value != widths[name]:
             remedy = (
                 f"has {name}={widths[name]}, not {value}; "
-                f"use config.with_size(..., {config.size!r}), or size={config_lib.CUSTOM!r}"
+                f"use agent.with_size(..., {config.size!r}), or size={CUSTOM!r}"
             )
             raise InvalidInput("size", config.size, remedy)
 
@@ -202,25 +192,9 @@ def _check_project(name: str) -> None:
         raise InvalidInput("tracker_project", name, remedy)
 
 
-def _check_widths(config: Config) -> None:
-    model = config.world_model
-    if isinstance(model, StormConfig):
-        if model.deter % model.heads:
-            remedy = f"use a multiple of world_model.heads={model.heads}"
-            raise InvalidInput("world_model.deter", model.deter, remedy)
-        return
-    assert isinstance(model, RSSMConfig)
-    if model.deter % model.blocks:
-        remedy = f"use a multiple of world_model.blocks={model.blocks}"
-        raise InvalidInput("world_model.deter", model.deter, remedy)
-    if 4 * model.depth % model.blocks:  # channels of the map that the decoder starts from
-        remedy = f"use one of which 4 times is a multiple of world_model.blocks={model.blocks}"
-        raise InvalidInput("world_model.depth", model.depth, remedy)
-
-
 def _check_imagination(config: Config) -> None:
     """Where imagination starts, and what depends on it."""
-    imagination, model = config.imagination, config.world_model
+    imagination = config.imagination
     from_contexts = imagination.starts == "contexts"
     if from_contexts and config.critic.replay_scale:
         remedy = "use 0: its returns begin at posteriors, imagination at contexts"
@@ -228,24 +202,6 @@ def _check_imagination(config: Config) -> None:
     if from_contexts and imagination.context_length > config.replay.batch_length:
         remedy = f"use at most replay.batch_length={config.replay.batch_length}"
         raise InvalidInput("imagination.context_length", imagination.context_length, remedy)
-    if not isinstance(model, StormConfig):
-        return
-    if not from_contexts:
-        remedy = "use contexts: a transformer has no state to start from but its past"
-        raise InvalidInput("imagination.starts", imagination.starts, remedy)
-    length = config.replay.batch_length
-    if length > model.positions:
-        remedy = f"use at most world_model.positions={model.positions}"
-        raise InvalidInput("replay.batch_length", length, remedy)
-    # Training sees the first positions, as many as a batch is long.
-    needs = (
-        ("world_model.act_context", model.act_context, 0),
-        ("imagination.horizon", imagination.horizon, imagination.context_length),
-    )
-    for name, value, before in needs:
-        if before + value > length:
-            remedy = f"use at most {length - before}, or longer batches than {length}: "
-            raise InvalidInput(name, value, remedy + "training sees no later position")
 
 
 def _first_update(config: Config) -> int:
@@ -288,7 +244,7 @@ def _check_replay(config: Config) -> None:
 
 def _usual(config: Config) -> Config:
     """The preset of this run; that of the paper where it has none of its own."""
-    return presets.of(config).get(config.preset, presets.PAPER)
+    return registry.presets_of(config).get(config.preset, presets.PAPER)
 
 
 def _blame_batch(config: Config) -> None:
@@ -350,7 +306,7 @@ def _check_counters(config: Config) -> None:
 
 def _check_env(config: Config) -> None:
     """What a suite allows: its own choices, its action repeat, its images."""
-    kind = config_lib.ENV_CONFIGS[config.suite]
+    kind = ENV_CONFIGS[config.suite]
     if type(config.env) is not kind:
         remedy = f"suite {config.suite} takes a {kind.__name__}"
         raise InvalidInput("env", type(config.env).__name__, remedy)
@@ -411,11 +367,12 @@ def check_images(config: Config, *, present: bool) -> None:
 
 def preset(agent: str, suite: str, name: str, size: str | None = None) -> Config:
     """The config of a preset, at another size where one is given."""
-    check_choice("agent", agent, presets.PRESETS)
-    check_choice("suite", suite, presets.PRESETS[agent])
-    known = presets.PRESETS[agent][suite]
+    check_choice("agent", agent, registry.names())
+    row = registry.kind(agent)
+    check_choice("suite", suite, row.presets)
+    known = row.presets[suite]
     check_choice("preset", name, known)
     if size is None:
         return known[name]
-    check_choice("size", size, config_lib.SIZES[agent])
-    return config_lib.with_size(known[name], size)
+    check_choice("size", size, [*row.sizes, CUSTOM])
+    return registry.with_size(known[name], size)

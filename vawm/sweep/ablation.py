@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
-from vawm import config as config_lib
+from vawm.agent import registry
 from vawm.analysis.tables import write_csv
 from vawm.cli import flags
 from vawm.runs import validate
@@ -166,7 +166,7 @@ def make_sweep(ablation: Ablation, options: Options, programs: pathlib.Path) -> 
       InvalidInput: there is no such agent, or the ablation makes no sense for it.
     """
     scale = scale_of(ablation, options)
-    validate.check_choice("agent", options.agent, config_lib.AGENT_CONFIGS)
+    validate.check_choice("agent", options.agent, registry.names())
     return Sweep(
         program=programs / PROGRAMS[scale.suite],
         folder=options.runs / result_name(ablation, options),

@@ -20,6 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from vawm import config as config_lib
+from vawm.agent import registry
+from vawm.agent.registry import UnknownAgent
 from vawm.config import Config
 from vawm.errors import InvalidInput
 from vawm.runs import validate
@@ -169,14 +171,15 @@ def config_from_dict(content: dict[str, Any], cls: type = Config) -> Any:
         raise InvalidInput(f"{cls.__name__}.{name[:40]}", content.get(name), verb)
     hints = dict(config_lib.kinds(cls))
     if cls is Config:
-        for name, known in (
-            ("suite", config_lib.ENV_CONFIGS),
-            ("agent", config_lib.AGENT_CONFIGS),
-        ):
-            if not isinstance(content[name], str) or content[name] not in known:
-                raise InvalidInput(f"Config.{name}", content[name], "is not known")
-        hints["env"] = config_lib.ENV_CONFIGS[content["suite"]]
-        hints |= config_lib.AGENT_CONFIGS[content["agent"]]._asdict()
+        suite = content["suite"]
+        if not isinstance(suite, str) or suite not in config_lib.ENV_CONFIGS:
+            raise InvalidInput("Config.suite", suite, "is not known")
+        row = registry.kind(_choice("Config.agent", content["agent"], str))
+        hints |= {
+            "env": config_lib.ENV_CONFIGS[suite],
+            "world_model": row.world_model,
+            "optimizer": row.optimizer,
+        }
     return cls(
         **{
             name: config_from_dict(value, hints[name])
@@ -252,6 +255,7 @@ def read(folder: pathlib.Path) -> Manifest:
     Raises:
       Damaged: it is missing, changed, too large, or describes no checkpoint of ours.
       OtherVersion: its layout or a choice is not known, or could not be run.
+      UnknownAgent: nothing has registered its agent.
     """
     digest, text = _content(folder / DIGEST, 1024), _content(folder / NAME, MAX_BYTES)
     if not re.fullmatch(rb"[0-9a-f]{64}\n", digest):
@@ -265,7 +269,7 @@ def read(folder: pathlib.Path) -> Manifest:
             raise OtherVersion("checkpoint", folder, why, written=written)
         manifest = _parse(content)
         validate.check(manifest.config)
-    except OtherVersion:
+    except (OtherVersion, UnknownAgent):
         raise
     except InvalidInput as error:
         written = content["version"]

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import jax
 
 from vawm import distributions, losses
-from vawm.agent import Agent
+from vawm.agent.actor_critic import Critic
 from vawm.config import VagramConfig
 from vawm.losses import transforms
 from vawm.types import Array, Inference, Latent, PyTree, flat_stoch
@@ -22,9 +22,9 @@ FORMS = {
 
 
 def make_value_gradient_loss(
-    agent: Agent, model: VagramConfig
+    critic: Critic, model: VagramConfig
 ) -> Callable[[PyTree, PyTree, Inference], Array]:
-    """Build `value_gradient_loss(critic_params, slow_critic, inference) -> [B, T]`.
+    """Build `value_gradient_loss(critic_params, slow_critic_params, inference) -> [B, T]`.
 
         L = scale * sum_j (dV/dz_j)^2 (z~_j - sg z_j)^2,    dV/dz at (h_t, z_t)
 
@@ -38,11 +38,11 @@ def make_value_gradient_loss(
     """
     form = FORMS[model.value_gradient_form]
 
-    def value_of(critic: PyTree, deter: Array) -> Callable[[Array], Array]:
+    def value_of(params: PyTree, deter: Array) -> Callable[[Array], Array]:
         def value(z: Array) -> Array:
             stoch = z.reshape(*z.shape[:-1], model.stoch, model.classes)
             stoch = distributions.on_simplex(stoch).astype(deter.dtype)
-            mean = agent.critic.code.mean(agent.critic.logits(critic, Latent(deter, stoch)))
+            mean = critic.code.mean(critic.logits(params, Latent(deter, stoch)))
             return transforms.symlog(mean) if model.value_gradient_unit == "symlog" else mean
 
         return value
@@ -50,7 +50,7 @@ def make_value_gradient_loss(
     def probabilities(logits: Array) -> Array:
         return flat_stoch(distributions.probabilities(logits, unimix=model.unimix))
 
-    def value_gradient_loss(critic: PyTree, slow_critic: PyTree, inference: Inference) -> Array:
+    def value_gradient_loss(online: PyTree, slow: PyTree, inference: Inference) -> Array:
         target = probabilities(inference.post_logits)
         prediction = probabilities(inference.prior_logits)
         deter = jax.lax.stop_gradient(inference.latent.deter)
@@ -60,7 +60,7 @@ def make_value_gradient_loss(
             return model.value_gradient_scale * form(value, prediction, target)
 
         if model.value_gradient_critic == "both":
-            return (loss(critic) + loss(slow_critic)) / 2
-        return loss(critic if model.value_gradient_critic == "online" else slow_critic)
+            return (loss(online) + loss(slow)) / 2
+        return loss(online if model.value_gradient_critic == "online" else slow)
 
     return value_gradient_loss

@@ -15,8 +15,8 @@ from toy_batch import batch, norm
 from vawm import losses
 from vawm.agent import make_agent
 from vawm.agent.actor_critic import Critic
+from vawm.agent.value_gradient import make_value_gradient_loss
 from vawm.learning import objective
-from vawm.learning.value_gradient import make_value_gradient_loss
 from vawm.losses.transforms import TwoHot
 from vawm.types import Inference, Latent, image
 
@@ -73,7 +73,7 @@ def slow_loss(critic, unit, scale):
 @pytest.mark.parametrize("unit", ["symlog", "raw"])
 def test_the_loss_equals_a_loop_over_the_entries_of_z(unit):
     choices = model(value_gradient_unit=unit, value_gradient_scale=0.3)
-    loss = jax.jit(make_value_gradient_loss(SIMPLE, choices))
+    loss = jax.jit(make_value_gradient_loss(SIMPLE.critic, choices))
     actual = loss(jnp.float32(1.5), jnp.float32(0.5), inference())
     expected = sum(slow_loss(critic, unit, 0.3) for critic in (1.5, 0.5)) / 2
     np.testing.assert_allclose(actual, expected, rtol=2e-4)
@@ -81,7 +81,7 @@ def test_the_loss_equals_a_loop_over_the_entries_of_z(unit):
 
 @pytest.mark.parametrize(("critic", "number"), [("online", 1.5), ("slow", 0.5)])
 def test_either_critic_alone_can_judge(critic, number):
-    loss = make_value_gradient_loss(SIMPLE, model(value_gradient_critic=critic))
+    loss = make_value_gradient_loss(SIMPLE.critic, model(value_gradient_critic=critic))
     actual = loss(jnp.float32(1.5), jnp.float32(0.5), inference())
     np.testing.assert_allclose(actual, slow_loss(number, "symlog", 1.0), rtol=2e-4)
 
@@ -100,7 +100,7 @@ def test_the_other_forms_are_those_of_the_library(form, function):
         value_gradient_critic="online",
         unimix=0.0,
     )
-    actual = make_value_gradient_loss(SIMPLE, choices)(jnp.float32(2), (), inference())
+    actual = make_value_gradient_loss(SIMPLE.critic, choices)(jnp.float32(2), (), inference())
     inferred = inference()
     h = inferred.latent.deter.mean(-1)
     flat = [x.stoch.reshape(*SHAPE, 16) for x in (inferred.prior_latent, inferred.latent)]
@@ -116,7 +116,7 @@ def test_the_joint_form_equals_its_derivatives_by_hand():
         value_gradient_critic="online",
         unimix=0.0,
     )
-    actual = make_value_gradient_loss(SIMPLE, choices)(jnp.float32(2), (), inference())
+    actual = make_value_gradient_loss(SIMPLE.critic, choices)(jnp.float32(2), (), inference())
     inferred = jax.tree.map(lambda x: np.asarray(x, np.float64), inference())
     h = inferred.latent.deter.mean(-1)[..., None]
     z, guess = (x.stoch.reshape(*SHAPE, 16) for x in (inferred.latent, inferred.prior_latent))
@@ -138,7 +138,7 @@ def test_a_critic_that_ignores_z_has_no_loss(form):
             )[..., None]
         )
     )
-    loss = make_value_gradient_loss(ignoring, model(value_gradient_form=form))
+    loss = make_value_gradient_loss(ignoring.critic, model(value_gradient_form=form))
     np.testing.assert_allclose(loss(jnp.float32(2), jnp.float32(3), inference()), 0, atol=1e-9)
 
 
@@ -177,7 +177,7 @@ def test_from_pixels_it_alone_trains_the_prior_and_every_layer_of_the_encoder():
     choices, pixels = model(depth=1), SPEC._replace(obs=image(48))
     config = dataclasses.replace(CONFIG, world_model=choices)
     agent = make_agent(config, pixels)
-    vagram = make_value_gradient_loss(agent, choices)
+    vagram = make_value_gradient_loss(agent.critic, choices)
     seen = np.random.default_rng(0).integers(0, 256, (2, 9, 48, 48, 3), np.uint8)
     data = batch(agent)
     data = data._replace(trajectory=data.trajectory._replace(obs=jnp.asarray(seen)))

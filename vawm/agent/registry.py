@@ -1,0 +1,210 @@
+"""The kinds of agents: one row for each, and everything the package asks about it.
+
+    import vawm.agent
+
+    vawm.agent.register("gru", GRUConfig, gru)
+
+A row says which config a world model has and how it is built; the rest has defaults. Training,
+`--resume`, evaluation, export, analysis and sweeps look rows up here by `Config.agent`, and ask
+nothing else about the kind of a world model. Our own rows are in `vawm.agent.kinds`.
+
+Rows of other packages are registered when their module is imported. A program imports the
+modules that `--plugin` or the environment variable `VAWM_PLUGINS` names, `vawm.agent.plugins`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import typing
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+from vawm import config as choices
+from vawm import presets
+from vawm.agent import plugins
+from vawm.config import CUSTOM, Config, LaPropConfig, OptimizerConfig, WorldModelConfig
+from vawm.errors import InvalidInput, Rule
+from vawm.world_model.protocol import WorldModel
+
+Sizes = Mapping[str, Mapping[str, int]]
+"""Name of a size -> field of the world model's config -> width."""
+Presets = Mapping[str, Mapping[str, Config]]
+"""Suite -> name of a preset -> config."""
+
+
+class Activations(NamedTuple):
+    """How many float32 numbers an update keeps for its gradient; `runs.budget` adds them up."""
+
+    observed: int  # per replayed step, apart from images
+    cache: int = 0  # of all imagined sequences together, such as keys and values
+    maps: int = 0  # in the encoder's and decoder's maps, for the images of one step
+
+
+class AgentKind(NamedTuple):
+    """One row.
+
+    Attributes:
+      world_model: config class of the world model; every field has a default.
+      make: `(config.world_model, spec, *, dtype, noise) -> WorldModel`.
+      optimizer: `LaPropConfig` for one gradient of one summed loss, `AdamConfig` for the world
+        model first and then actor and critic.
+      sizes: what `--size` offers.
+      presets: what `--preset` offers.
+      rules: field of the world model's config -> what its number must be; positive if not here.
+      check: `(config) -> None`; raises `InvalidInput` for what cannot run.
+      activations: `(config, image_size) -> Activations`; `image_size` is None without images.
+      context_limited: whether the world model knows only as many positions as a training
+        sequence has, so that nothing longer can be imagined.
+      make_latent_loss: `(critic, config.world_model) -> loss(critic_params, slow_critic_params,
+        inference) -> [B, T]`, a further loss of the world model; None for none.
+    """
+
+    world_model: type[WorldModelConfig]
+    make: Callable[..., WorldModel]
+    optimizer: type[OptimizerConfig]
+    sizes: Sizes
+    presets: Presets
+    rules: Mapping[str, Rule]
+    check: Callable[[Config], None]
+    activations: Callable[[Config, int | None], Activations]
+    context_limited: bool
+    make_latent_loss: Callable[..., Callable[..., Any]] | None
+
+
+class UnknownAgent(InvalidInput):
+    """An agent that no module in this process has registered."""
+
+    def __init__(self, name: object):
+        remedy = (
+            f"is not registered; use one of {', '.join(_ROWS)}, import the module that "
+            f"registers it, or give a program --plugin FILE.py (or {plugins.VARIABLE}=FILE.py)"
+        )
+        super().__init__("agent", name, remedy)
+
+
+_ROWS: dict[str, AgentKind] = {}
+
+
+def register(
+    name: str,
+    world_model: type[WorldModelConfig],
+    make: Callable[..., WorldModel],
+    *,
+    optimizer: type[OptimizerConfig] = LaPropConfig,
+    sizes: Sizes | None = None,
+    presets: Presets | None = None,
+    rules: Mapping[str, Rule] | None = None,
+    check: Callable[[Config], None] | None = None,
+    activations: Callable[[Config, int | None], Activations] | None = None,
+    context_limited: bool = False,
+    make_latent_loss: Callable[..., Callable[..., Any]] | None = None,
+) -> None:
+    """Adds a kind of agent; the arguments are the attributes of `AgentKind`.
+
+    Without `presets` it gets those of dreamerv3 with this world model's defaults. Without
+    `sizes` the only size is custom. Running a module or a cell of a notebook again replaces the
+    row of the same class; a name that another module has taken is refused.
+
+    Raises:
+      InvalidInput: a name that is taken or cannot be a name, or a config class that cannot be
+        saved: not a frozen dataclass, a field without default or of another type than a number,
+        a bool, a text or a `Literal`.
+    """
+    if not re.fullmatch(r"[a-z0-9][a-z0-9_-]{0,39}", name):
+        remedy = "use up to 40 small letters, digits, '-' and '_', a letter or digit first"
+        raise InvalidInput("agent", name, remedy)
+    _check_class(world_model)
+    if name in _ROWS and _origin(_ROWS[name].world_model) != _origin(world_model):
+        remedy = (
+            f"is registered by {'.'.join(_origin(_ROWS[name].world_model))}; use another name"
+        )
+        raise InvalidInput("agent", name, remedy)
+    sizes = sizes or {}
+    _ROWS[name] = AgentKind(
+        world_model=world_model,
+        make=make,
+        optimizer=optimizer,
+        sizes=sizes,
+        presets=presets or _presets_like_dreamerv3(name, world_model, sizes),
+        rules=rules or {},
+        check=check or (lambda config: None),
+        activations=activations or default_activations,
+        context_limited=context_limited,
+        make_latent_loss=make_latent_loss,
+    )
+
+
+def _origin(cls: type) -> tuple[str, str]:
+    return cls.__module__, cls.__qualname__
+
+
+def _check_class(cls: type[WorldModelConfig]) -> None:
+    if not (isinstance(cls, type) and issubclass(cls, WorldModelConfig)):
+        raise InvalidInput("world_model", cls, "derive it from vawm.config.WorldModelConfig")
+    name = cls.__name__
+    if "__dataclass_params__" not in vars(cls) or not vars(cls)["__dataclass_params__"].frozen:
+        raise InvalidInput("world_model", name, "decorate it with @dataclass(frozen=True)")
+    kinds = choices.kinds(cls)  # type: ignore[arg-type]
+    for field in dataclasses.fields(cls):
+        if field.default is dataclasses.MISSING:
+            raise InvalidInput(f"{name}.{field.name}", None, "has no default; give it one")
+        kind = kinds[field.name]
+        if (
+            kind not in (int, float, bool, str)
+            and typing.get_origin(kind) is not typing.Literal
+        ):
+            remedy = "use int, float, bool, str or a Literal, which can be a flag and be saved"
+            raise InvalidInput(f"{name}.{field.name}", kind, remedy)
+
+
+def _presets_like_dreamerv3(name: str, cls: type[WorldModelConfig], sizes: Sizes) -> Presets:
+    """The runs of dreamerv3's presets, with another world model in them."""
+
+    def like(config: Config) -> Config:
+        config = dataclasses.replace(config, agent=name, size=CUSTOM, world_model=cls())  # type: ignore[call-arg]
+        for size, widths in sizes.items():  # the first
+            return choices.with_widths(config, size, widths)
+        return config
+
+    return {
+        suite: {preset: like(config) for preset, config in named.items()}
+        for suite, named in presets.DREAMERV3.items()
+    }
+
+
+def default_activations(config: Config, image_size: int | None) -> Activations:
+    """A rough upper bound for an encoder, a recurrence and heads of `units` width."""
+    model, critic = config.world_model, config.critic
+    feature = model.deter + model.stoch * model.classes
+    layers = 12 * model.units + config.actor.layers * config.actor.units
+    observed = 8 * feature + 4 * (layers + critic.layers * critic.units + 4 * critic.bins)
+    size = image_size or 0
+    return Activations(observed, maps=2 * size * size * (3 + 4 * model.depth))
+
+
+def names() -> tuple[str, ...]:
+    """All agents that are registered."""
+    plugins.load_named()
+    return tuple(_ROWS)
+
+
+def kind(name: str) -> AgentKind:
+    """The row of an agent.
+
+    Raises:
+      UnknownAgent: nothing has registered it.
+    """
+    if name not in names():
+        raise UnknownAgent(name)
+    return _ROWS[name]
+
+
+def presets_of(config: Config) -> Mapping[str, Config]:
+    """The presets of this agent in this suite, by name."""
+    return kind(config.agent).presets[config.suite]
+
+
+def with_size(config: Config, size: str) -> Config:
+    """`config` with the widths that its agent has at this size."""
+    return choices.with_widths(config, size, kind(config.agent).sizes[size])
