@@ -73,9 +73,14 @@ def _load(name: str) -> None:
 def _load_file(path: pathlib.Path) -> None:
     if not path.is_file():
         raise InvalidInput("plugin", str(path), "there is no such file; check the path")
-    spec = importlib.util.spec_from_file_location(path.stem, path)
+    name = path.stem if path.stem not in sys.modules else f"{path.stem} of {path}"
+    spec = importlib.util.spec_from_file_location(name, path)
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    sys.modules[path.stem] = module  # where dataclasses look their types up
-    spec.loader.exec_module(module)
+    sys.modules[name] = module  # where dataclasses look their types up
+    try:
+        spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[name]
+        raise

@@ -19,7 +19,7 @@ from typing import Annotated, NamedTuple
 import tyro
 
 from vawm.agent import registry
-from vawm.cli import flags as flags_lib
+from vawm.cli import flags
 from vawm.config import CUSTOM, Config
 from vawm.envs.protocol import EnvironmentFailure
 from vawm.errors import InvalidInput
@@ -96,17 +96,18 @@ def parse(
         run of another suite.
       SystemExit: help was asked for (0).
     """
-    argv = list(sys.argv[1:] if argv is None else argv)
+    argv = flags.load_plugins(list(sys.argv[1:] if argv is None else argv))
     argv = [_without_alias(word, aliases or {}) for word in argv]
     default = Flags(_defaults(argv, suite, preset))
-    flags = flags_lib.read(Flags, argv, default=default, description=description)
-    if flags.fresh and flags.logdir is None:
+    given = flags.read(Flags, argv, default=default, description=description)
+    if given.fresh and given.logdir is None:
         raise InvalidInput("logdir", None, "--fresh needs the --logdir to start over in")
-    config = _with_its_size(flags.config)
+    config = _with_its_size(given.config)
     if config.suite != suite:
         remedy = f"this program runs suite {suite}; use the one of that suite"
         raise InvalidInput("suite", config.suite, remedy)
-    return Arguments(config, flags.logdir or default_logdir(config), flags.resume, flags.fresh)
+    logdir = given.logdir or default_logdir(config)
+    return Arguments(config, logdir, given.resume, given.fresh)
 
 
 def _without_alias(word: str, aliases: Mapping[str, str]) -> str:
