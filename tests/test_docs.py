@@ -16,11 +16,10 @@ import pytest
 import scipy.special
 import tiny
 
-from vawm import envs
-from vawm.agent import make_agent, registry
+from vawm import envs, policy
+from vawm.agent import make_agent, plugins, registry
 from vawm.cli import command_line, flags
 from vawm.envs import probes
-from vawm.policy import policy as policy_lib
 from vawm.runs import runner, suites, validate
 
 ROOT = pathlib.Path(__file__).parents[1]
@@ -29,7 +28,7 @@ PAPER = DOCS / "paper.md"
 PAGES = sorted(DOCS.rglob("*.md"))
 TEXTS = {str(path.relative_to(ROOT)): path.read_text() for path in [README, *PAGES]}
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
-OTHERS_FLAGS = {"--help", "--strict"}  # of every program, and of mkdocs
+OTHERS_FLAGS = {"--help", "--plugin", "--strict"}  # of every program, and of mkdocs
 
 
 def load(path):
@@ -116,14 +115,14 @@ def stage(tmp_path, monkeypatch):
         agent = make_agent(tiny.CONFIG, spec)
         params, state = jax.jit(agent.init)(jax.random.key(0))
         act = jax.jit(agent.act, static_argnames="how")
-        return policy_lib.Policy(tiny.CONFIG, spec, 0, params, state, agent.initial, act)
+        return policy.Policy(tiny.CONFIG, spec, 0, params, state, agent.initial, act)
 
     def make(task, *, num_envs, action_repeat):
         assert (task, action_repeat) == (tiny.CONFIG.task, tiny.CONFIG.action_repeat)
         return probes.make("observation_action", num_envs=num_envs)
 
     monkeypatch.setattr(runner, "run", run)
-    monkeypatch.setattr(policy_lib, "load", load_policy)
+    monkeypatch.setattr(policy, "load", load_policy)
     monkeypatch.setattr(envs, "make", make)
     return trained
 
@@ -208,6 +207,7 @@ COMMANDS = sorted({command for text in TEXTS.values() for command in commands(te
 @pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
 def test_a_command_is_one_that_would_start(command, monkeypatch):
     program, *argv = command
+    monkeypatch.setenv(plugins.VARIABLE, "")
     program = pathlib.Path(program).stem if "/" in program else program
     if OPTIONS[program]:
         needs = "logdir" in OPTIONS[program].__dataclass_fields__ and "--logdir" not in argv

@@ -53,10 +53,9 @@ def _is_file(name: str) -> bool:
 
 
 def _load(name: str) -> None:
-    path = pathlib.Path(name)
-    main = getattr(sys.modules.get("__main__"), "__file__", None)
-    if _is_file(name) and main and pathlib.Path(main).resolve() == path.resolve():
-        return  # the program itself, which registers what it has
+    path = pathlib.Path(name).resolve()
+    if _is_file(name) and _is_imported(path):
+        return  # such as the program itself, which registers what it has
     try:
         if _is_file(name):
             _load_file(path)
@@ -68,6 +67,12 @@ def _load(name: str) -> None:
         reason = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
         remedy = f"cannot be imported ({reason}); name a module, or a file that ends in .py"
         raise InvalidInput("plugin", name, remedy) from error
+
+
+def _is_imported(path: pathlib.Path) -> bool:
+    files = (getattr(module, "__file__", None) for module in list(sys.modules.values()))
+    same = (file for file in files if file and pathlib.Path(file).name == path.name)
+    return any(pathlib.Path(file).resolve() == path for file in same)
 
 
 def _load_file(path: pathlib.Path) -> None:

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+import sys
 import typing
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
@@ -136,7 +137,9 @@ def register(
 
 
 def _origin(cls: type) -> tuple[str, str]:
-    return cls.__module__, cls.__qualname__
+    """Where a class is written: the same for a file that is imported under another name."""
+    module = sys.modules.get(cls.__module__)
+    return getattr(module, "__file__", None) or cls.__module__, cls.__qualname__
 
 
 def _check_class(cls: type[WorldModelConfig]) -> None:

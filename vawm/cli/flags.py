@@ -40,9 +40,8 @@ def read(
       SystemExit: help was asked for (0).
     """
     argv = load_plugins(list(sys.argv[1:] if argv is None else argv))
-    offered = _offering(cls, default)
-    start = None if default is None else _recast(default, offered)
-    given: Any = {} if start is None else {"default": start}
+    offered = _offering(cls)
+    given: Any = {} if default is None else {"default": _recast(default, offered)}
     box = io.StringIO()
     try:
         with contextlib.redirect_stderr(box):
@@ -52,9 +51,9 @@ def read(
     except SystemExit as error:
         if not error.code:
             raise
-        raise _bad_value(box.getvalue(), argv, known(offered, start)) from None
+        raise _bad_value(box.getvalue(), argv, known(cls, default)) from None
     if unknown:
-        raise _unknown(unknown, known(offered, start))
+        raise _unknown(unknown, known(cls, default))
     return _recast(result, cls)
 
 
@@ -85,16 +84,16 @@ def load_plugins(argv: list[str]) -> list[str]:
     return left
 
 
-def _offering(cls: type, default: Any) -> type:
+def _offering(cls: type) -> type:
     """`cls`, where a field that is an `AgentName` is one of the agents that are registered."""
     changed: list[tuple[str, Any]] = []
-    hints = typing.get_type_hints(cls, include_extras=True)
+    hints, offered = typing.get_type_hints(cls, include_extras=True), kinds(cls)
     for field in dataclasses.fields(cls):
-        hint, value = hints[field.name], getattr(default, field.name, None)
+        hint = hints[field.name]
         if hint == AgentName:
-            changed.append((field.name, typing.Literal[registry.names()]))
+            changed.append((field.name, offered[field.name]))
         elif field.name == "config":
-            inner = _offering(Config, value)
+            inner = _offering(Config)
             changed.append((field.name, Annotated[(inner, *typing.get_args(hint)[1:])]))
     if not changed:
         return cls
@@ -115,7 +114,7 @@ def known(cls: type, default: Any = None, prefix: str = "") -> dict[str, Any]:
 
     Where `default` holds a subclass of what a field is declared as, its fields count.
     """
-    hints = typing.get_type_hints(cls)
+    hints = kinds(cls)
     result: dict[str, Any] = {}
     for field in dataclasses.fields(cls):
         name, kind = prefix + field.name, hints[field.name]
@@ -128,9 +127,17 @@ def known(cls: type, default: Any = None, prefix: str = "") -> dict[str, Any]:
     return result
 
 
+def kinds(cls: type) -> dict[str, Any]:
+    """Field -> type, of a dataclass; that of an `AgentName` has the names of all agents."""
+    plain = typing.get_type_hints(cls)
+    marked = typing.get_type_hints(cls, include_extras=True)
+    agents = (name for name, hint in marked.items() if hint == AgentName)
+    return plain | dict.fromkeys(agents, typing.Literal[registry.names()])
+
+
 def choices(cls: type, name: str) -> tuple[str, ...]:
     """What a field that is a `Literal` may be."""
-    return typing.get_args(typing.get_type_hints(cls)[name])
+    return typing.get_args(kinds(cls)[name])
 
 
 def _dashed(flag: str) -> str:
