@@ -39,7 +39,11 @@ def load(path):
     return module
 
 
+ROWS = dict(registry._ROWS)
 PROGRAMS = {path.stem: load(path) for path in (ROOT / "experiments").rglob("*.py")}
+WITH_OWN = dict(registry._ROWS)  # with what a program has registered
+registry._ROWS.clear()
+registry._ROWS.update(ROWS)  # other tests of this process know no more than the package
 PROGRAMS |= {  # those of the package, `python -m`
     f"vawm.{path.stem}": importlib.import_module(f"vawm.{path.stem}")
     for path in (ROOT / "vawm").glob("*.py")
@@ -121,6 +125,7 @@ def stage(tmp_path, monkeypatch):
         assert (task, action_repeat) == (tiny.CONFIG.task, tiny.CONFIG.action_repeat)
         return probes.make("observation_action", num_envs=num_envs)
 
+    monkeypatch.setattr(registry, "_ROWS", dict(registry._ROWS))
     monkeypatch.setattr(runner, "run", run)
     monkeypatch.setattr(policy, "load", load_policy)
     monkeypatch.setattr(envs, "make", make)
@@ -208,6 +213,7 @@ COMMANDS = sorted({command for text in TEXTS.values() for command in commands(te
 def test_a_command_is_one_that_would_start(command, monkeypatch):
     program, *argv = command
     monkeypatch.setenv(plugins.VARIABLE, "")
+    monkeypatch.setattr(registry, "_ROWS", WITH_OWN)
     program = pathlib.Path(program).stem if "/" in program else program
     if OPTIONS[program]:
         needs = "logdir" in OPTIONS[program].__dataclass_fields__ and "--logdir" not in argv

@@ -159,8 +159,8 @@ def test_a_config_that_could_not_be_saved_is_refused(register, cls, field):
 
 def test_an_agent_that_nothing_registered_is_named_with_those_that_are():
     for lookup in (registry.kind, lambda name: manifest.config_from_dict(saved(name))):
-        with pytest.raises(registry.UnknownAgent, match=r"agent='gru'.*dreamerv3.*--plugin"):
-            lookup("gru")
+        with pytest.raises(registry.UnknownAgent, match=r"agent='nobody'.*dreamerv3.*--plugin"):
+            lookup("nobody")
 
 
 def saved(agent):
