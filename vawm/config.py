@@ -1,4 +1,4 @@
-"""Every choice of a run, as frozen dataclasses; `vawm.presets` has values of them.
+"""Every choice of a run, as frozen dataclasses; `vawm.presets` has sets of values.
 
 Numbers are those of the paper, Table 15 for DreamerV3 and Tables 7-14 for STORM, unless their
 comment names another source. Nothing here imports the rest of the package. Factories read
@@ -15,14 +15,14 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, NamedTuple
 
 Network = Literal["dreamerv3", "storm"]
-"""Hidden layers: with bias, RMSNorm, SiLU; or without bias, LayerNorm, ReLU."""
+"""Hidden layers. dreamerv3: bias, RMSNorm, SiLU; storm: no bias, LayerNorm, ReLU."""
 Bins = Literal["symexp", "symlog"]
 """Bins of a two-hot code: values spaced by symexp, or evenly spaced values of symlog."""
 
 
 @dataclass(frozen=True)
 class WorldModelConfig:
-    """What all world models have. A world model of your own derives its config from this."""
+    """What every world model has. Derive the config of your own world model from this."""
 
     deter: int
     """width of h"""
@@ -33,7 +33,7 @@ class WorldModelConfig:
     units: int
     """width of the hidden layers of encoder, decoder, reward and continue heads"""
     depth: int = 16
-    """channels of the image encoder's first stage and the decoder's last, up to a factor"""
+    """scales the channels of the image encoder and decoder"""
     bins: int = 255
     """bins of the two-hot reward"""
     bin_spacing: Bins = "symexp"
@@ -41,11 +41,12 @@ class WorldModelConfig:
     unimix: float = 0.01
     """uniform share mixed into prior and posterior"""
     free_nats: float = 1.0
+    """KL below which the dynamics loss has no gradient"""
     free_nats_of: Literal["state", "batch"] = "state"
-    """what has them: the KL of each state, or the mean over the batch, whose gradient then is 0
-    for all states at once"""
+    """state: applies to the KL of each state; batch: to the mean KL of the batch, so that below
+    it no state has a gradient"""
     continue_target: Literal["discounted", "plain"] = "discounted"
-    """what the continue head learns where an episode goes on: gamma, or 1"""
+    """target of the continue head while an episode continues: gamma (discounted) or 1 (plain)"""
     reconstruction_scale: float = 1.0
     dynamics_scale: float = 1.0
     representation_scale: float = 0.1
@@ -72,42 +73,41 @@ class RSSMConfig(HeadsConfig):
     classes: int = 16
     units: int = 256
     depth: int = 16
-    """channels of the image encoder and decoder, whose stages have 2, 3, 4 and 4 times these"""
+    """the stages of the image encoder have 2, 3, 4 and 4 times this many channels"""
     hidden: int = 256
     """width of the layers around h"""
     prior_layers: int = 2
     reconstruction_gradient: bool = True
-    """whether reconstruction shapes the latents; else the decoder only shows what they hold"""
+    """whether the reconstruction loss trains the latents, or the decoder alone"""
 
 
 @dataclass(frozen=True)
 class VagramConfig(RSSMConfig):
-    """A deterministic RSSM that learns what the value depends on, in the place of likelihood.
+    """A deterministic RSSM trained by the value's gradient (VaGraM) instead of the KL.
 
-    z is its categoricals' probabilities. The prior is trained by VaGraM; latents by that, by
-    rewards, continuation and the replay value loss.
+    z holds probabilities instead of samples. VaGraM trains the prior. VaGraM, the reward, continue
+    and replay value losses train the latents.
     """
 
     dynamics_scale: float = 0.0
-    """of the KL, which VaGraM replaces"""
+    """of the KL, off because VaGraM replaces it"""
     representation_scale: float = 0.0
-    """of the KL, which VaGraM replaces"""
+    """of the KL, off because VaGraM replaces it"""
     reconstruction_gradient: bool = False
     value_gradient_scale: float = 1.0
-    """of VaGraM's loss"""
+    """weight of VaGraM's loss"""
     value_gradient_form: Literal["diagonal", "taylor", "second_order", "joint"] = "diagonal"
-    """sum_j (dV/dz_j e_j)^2, the official one; (dV/dz . e)^2; or, with the Hessian, the latter
-    or the former"""
+    """of the error e = z~ - z. diagonal: sum_j (dV/dz_j e_j)^2, the official form; taylor:
+    (dV/dz . e)^2; second_order and joint: taylor and diagonal with the Hessian of V"""
     value_gradient_critic: Literal["online", "slow", "both"] = "both"
-    """whose gradient; both: the mean of two losses, as the official code has it"""
+    """which critic's gradient; both: the mean of two losses, as in the official code"""
     value_gradient_unit: Literal["symlog", "raw"] = "symlog"
-    """of V: its symlog, whose gradients do not grow with the scale of rewards; or V"""
+    """symlog: gradient of symlog V, which does not grow with the scale of rewards; raw: of V"""
 
 
 @dataclass(frozen=True)
 class StormConfig(WorldModelConfig):
-    """The transformer world model of STORM: Tables 7-14, and the official code where they are
-    silent."""
+    """The transformer world model of STORM: Tables 7-14, else the official code."""
 
     deter: int = 512
     """width of the transformer, whose output is h"""
@@ -115,10 +115,10 @@ class StormConfig(WorldModelConfig):
     classes: int = 32
     units: int = 512
     depth: int = 32
-    """channels of the image encoder and decoder, whose stages have 1, 2, 4 and 8 times these"""
+    """the stages of the image encoder have 1, 2, 4 and 8 times this many channels"""
     bin_spacing: Bins = "symlog"
     free_nats_of: Literal["state", "batch"] = "batch"
-    """batch: the official code; state: as DreamerV3"""
+    """batch: as the official code; state: as DreamerV3"""
     continue_target: Literal["discounted", "plain"] = "plain"
     dynamics_scale: float = 0.5
     blocks: int = 2
@@ -128,19 +128,19 @@ class StormConfig(WorldModelConfig):
     """hidden width of a block's feed-forward layer"""
     dropout: float = 0.1
     positions: int = 64
-    """learned positions: no sequence can be longer"""
+    """number of learned positions; no sequence can be longer"""
     vector_layers: int = 2
-    """hidden layers of encoder and decoder of vectors, which the paper has not"""
+    """hidden layers of the encoder and decoder of vectors; the paper uses images only"""
     head_layers: int = 2
     """hidden layers of the reward and continue heads"""
     act_context: int = 16
     """steps that the agent remembers while it acts"""
     act_latent: Literal["prior", "posterior"] = "prior"
-    """what the policy reads: the prediction, made before the observation is seen, as in the
-    official code; or what is inferred from the observation"""
+    """prior: the policy reads the prediction made before the observation arrives, as in the
+    official code; posterior: it reads the latent inferred from the observation"""
     clear_context: bool = False
-    """whether attention ends where an episode begins, in training, imagination and acting; it
-    does not in the official code"""
+    """whether attention stops at the start of an episode, in training, imagination and acting;
+    in the official code it does not"""
 
 
 @dataclass(frozen=True)
@@ -148,17 +148,17 @@ class ActorConfig:
     layers: int = 3
     units: int = 256
     network: Network = "dreamerv3"
-    """hidden layers: biased, RMSNorm, SiLU; or, storm, without bias, LayerNorm, ReLU"""
+    """hidden layers. dreamerv3: bias, RMSNorm, SiLU; storm: no bias, LayerNorm, ReLU"""
     unimix: float = 0.01
-    """uniform share of a discrete policy"""
+    """uniform share mixed into a discrete policy"""
     min_std: float = 0.1
     max_std: float = 1.0
     scale: float = 1.0
     entropy_scale: float = 1e-3
     """Table 15; public DreamerV3 codes use 3e-4"""
     collect_temperature: float = 1.0
-    """divides the logits of a discrete policy while it collects, never in a loss; 0.01 is
-    what IRIS does on Freeway, and the paper with it"""
+    """divides the logits of a discrete policy while it collects, never in a loss; IRIS and the
+    paper use 0.01 on Freeway"""
 
 
 @dataclass(frozen=True)
@@ -166,7 +166,7 @@ class CriticConfig:
     layers: int = 3
     units: int = 256
     network: Network = "dreamerv3"
-    """hidden layers as the actor's; dreamerv3 starts by predicting 0, storm does not"""
+    """hidden layers, as for the actor; dreamerv3 initially predicts 0, storm does not"""
     bins: int = 255
     bin_spacing: Bins = "symexp"
     """symexp: values spaced by symexp; symlog: evenly spaced symlogs, whose mean is decoded"""
@@ -176,29 +176,32 @@ class CriticConfig:
     slow_scale: float = 1.0
     """weight of the slow critic's target"""
     slow_target: Literal["value", "returns"] = "value"
-    """the second target: the slow critic's value, as in DreamerV3; or the lambda-returns of its
-    values, as in STORM's official code"""
+    """second target. value: the slow critic's value, as in DreamerV3; returns: lambda-returns of
+    its values, as in STORM's official code"""
     replay_scale: float = 0.3
     """weight of the replay value loss"""
     replay_gradient: bool = True
-    """whether the replay value loss reaches the world model, as in the official code"""
+    """whether the replay value loss trains the world model, as in the official code"""
 
 
 @dataclass(frozen=True)
 class ImaginationConfig:
     horizon: int = 15
+    """imagined steps"""
     starts: Literal["posteriors", "contexts"] = "posteriors"
-    """every inferred state of the batch; or the states predicted after contexts of their own"""
+    """posteriors: imagination starts at every inferred state of the batch; contexts: at the states
+    predicted after separately drawn contexts"""
     batch_size: int = 1024
     """contexts drawn for one update"""
     context_length: int = 8
     """steps of a context"""
     value_index: Literal["next", "current"] = "next"
-    """whose value lambda-returns mix in: of s_{t+1}, Eq. 7; or of s_t, STORM's official code"""
+    """lambda-returns mix in the value of s_{t+1} (next, Eq. 7) or of s_t (current, STORM's
+    official code)"""
     continuation: Literal["probability", "threshold"] = "probability"
-    """how the continue head is read: its probability, or 0 below one half and 1 above"""
+    """how the continue head is read: as its probability, or as 0 below one half and 1 above"""
     reach_weights: bool = True
-    """whether imagined states count by the probability of getting there"""
+    """whether imagined states are weighted by the probability of reaching them"""
     lambda_: float = 0.95
     discount_horizon: float = 333.0
     """gamma = 1 - 1 / discount_horizon"""
@@ -213,26 +216,28 @@ class ValueAlignmentConfig:
     """L_var, Eq. 4 and Eq. 5. The loss and its weight are logged even when off."""
 
     weight: Literal["adaptive", "static", "off"] = "adaptive"
-    """adaptive: 1 / max(1, KL), Eq. 5"""
+    """adaptive: 1 / max(1, KL) of each state, Eq. 5; off: plain DreamerV3 or STORM"""
     static_weight: float = 0.5
-    """used by weight="static", after the warm-up; Table 3"""
+    """the weight after the warm-up with weight="static"; Table 3"""
     warmup_steps: int = 10_000
-    """weight 0 up to and including this step; in small presets it scales with --env-steps"""
+    """the weight is 0 up to and including this step; in small presets it scales with --env-steps"""
     warmup_unit: Literal["env_steps", "updates"] = "env_steps"
+    """what warmup_steps counts"""
     dynamics_scale: float = 0.5
     """on KL[sg V(s) || V(s~)]"""
     representation_scale: float = 0.1
     """on KL[V(s) || sg V(s~)]; 0 gives the gradient of Eq. 4 as printed"""
     critic: Literal["online", "slow"] = "online"
+    """which critic L_var asks; its parameters are stopped"""
     deter_gradient: Literal["live", "stop"] = "live"
-    """whether L_var reaches h_t through the critic's input"""
+    """whether L_var has a gradient to h_t through the critic's input"""
     noise: Literal["independent", "shared"] = "independent"
-    """sampling noise of z~ against that of z"""
+    """whether z~ is sampled with its own noise or with the noise of z"""
 
 
 @dataclass(frozen=True)
 class OptimizerConfig:
-    """How parameters follow gradients: depends on the agent."""
+    """How parameters follow gradients; each agent has its own kind."""
 
 
 @dataclass(frozen=True)
@@ -251,11 +256,10 @@ class LaPropConfig(OptimizerConfig):
 
 @dataclass(frozen=True)
 class AdamConfig(OptimizerConfig):
-    """First the world model, then actor and critic in what it has become.
+    """Two Adams: one for the world model, then one for actor and critic in the new world model.
 
-    Table 14, and both epsilons of the official code.
-
-    Each has an Adam of its own after clipping by the global norm of its gradient.
+    Each clips by the global norm of its gradient first. Numbers of Table 14; both epsilons are the
+    official code's.
     """
 
     learning_rate: float = 1e-4
@@ -273,11 +277,13 @@ class AdamConfig(OptimizerConfig):
 @dataclass(frozen=True)
 class ReplayConfig:
     capacity: int = 5_000_000
-    """steps of all environments together; never more than the run collects is allocated"""
+    """steps of all environments together; a short run allocates only what it collects"""
     batch_size: int = 16
+    """sequences in a batch"""
     batch_length: int = 64
+    """steps of each"""
     images: Literal["device", "host"] = "device"
-    """where images are kept, as bytes; all else of replay is on the device"""
+    """which memory keeps the images, as bytes; the rest of replay is on the device"""
 
     @property
     def batch_steps(self) -> int:
@@ -287,16 +293,16 @@ class ReplayConfig:
 
 @dataclass(frozen=True)
 class VideoConfig:
-    """Videos of what the world model expects and of what the policy does, from images."""
+    """Videos of episodes and of open-loop predictions, for observations with images."""
 
     every: int = 0
     """env steps between videos; 0 for none"""
     sequences: int = 4
-    """replayed sequences in a video of open-loop prediction, side by side"""
+    """replayed sequences side by side in a video of open-loop prediction"""
     context: int = 5
     """steps that the world model sees before it has to predict the rest of the sequence"""
     episode_steps: int = 1_000
-    """steps of an episode that its video shows at most"""
+    """longest video of an episode, in steps"""
 
 
 @dataclass(frozen=True)
@@ -383,37 +389,42 @@ class Config:
     suite: Literal["dmc_proprio", "dmc_vision", "atari100k", "gymnasium"] = "dmc_proprio"
     """where the task is from"""
     task: str = "cartpole_swingup"
+    """name of the environment in its suite"""
     agent: AgentName = "dreamerv3"
-    """which world model imagines: the recurrent one of dreamerv3, the transformer of storm, the
-    deterministic one of vagram, or one that was registered"""
+    """the world model: recurrent (dreamerv3), a transformer (storm), recurrent without noise
+    (vagram), or one that was registered"""
     preset: str = "paper"
-    """where the other numbers come from: a preset of the agent in this suite, or custom"""
+    """set of defaults for the other numbers; custom: a set of your own"""
     size: str = "12m"
-    """whose widths these are: a size of the agent, or custom"""
+    """set of widths of the networks; custom: widths of your own"""
     seed: int = 0
+    """of parameters, environments and everything that is sampled"""
     env_steps: int = 500_000
+    """length of the run in control steps, of all environments together"""
     num_envs: int = 16
+    """environments side by side"""
     action_repeat: int = 2
+    """control steps for which an action is repeated"""
     train_ratio: int = 512
     """replayed steps per collected step; updates = train_ratio / (batch_size * batch_length)"""
     random_steps: int = 0
-    """env steps before which actions are random, each as likely as any other"""
+    """env steps at the beginning with uniformly random actions"""
     collect_steps: int = 1
-    """steps in every environment between updates, inside one jitted call"""
+    """steps of every environment between updates, in one jitted call"""
     compute_dtype: Literal["auto", "float32", "bfloat16"] = "auto"
     """auto: bfloat16 on GPU and TPU, float32 on CPU"""
     tracker: Literal["none", "wandb", "trackio"] = "none"
-    """where lines of metrics and videos go besides metrics.jsonl and TensorBoard"""
+    """where metrics and videos go in addition to metrics.jsonl and TensorBoard"""
     tracker_project: str = "vawm"
-    """name of the project there"""
+    """name of the project at the tracker"""
     log_every: int = 2_000
     """env steps between lines of metrics.jsonl"""
     save_every: int = 50_000
     """env steps between checkpoints"""
     save_minutes: float = 10.0
-    """minutes after which there is one as well; 0 for never"""
+    """minutes after which a checkpoint is saved as well; 0 for never"""
     keep_checkpoints: int = 2
-    """the newest ones; older ones are deleted"""
+    """how many of the newest checkpoints are kept"""
     world_model: WorldModelConfig = field(default_factory=RSSMConfig)
     actor: ActorConfig = field(default_factory=ActorConfig)
     critic: CriticConfig = field(default_factory=CriticConfig)
@@ -426,7 +437,7 @@ class Config:
 
 
 CUSTOM = "custom"
-"""the preset or size of a run that has numbers of its own"""
+"""Name of the preset or size of a run with numbers of its own."""
 
 
 class RSSMSize(NamedTuple):

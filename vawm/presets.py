@@ -45,15 +45,15 @@ QUICK = dataclasses.replace(
     optimizer=LaPropConfig(learning_rate=6e-4, warmup_updates=300),
     replay=ReplayConfig(batch_size=8, batch_length=32),
 )
-"""For a CPU with 2 cores: steps in the simulation cost little there and updates much, so it
-takes few small updates at a high learning rate, and long actions."""
+"""For a CPU with 2 cores, where simulation is cheap and updates are expensive: few small updates
+with a high learning rate, and an action repeat of 4."""
 
 SMALL = ("size", "world_model", "actor", "critic", "imagination", "optimizer", "replay")
-"""What the small presets of the other suites take from `QUICK`: all that an update costs."""
+"""Fields that the small presets of the other suites share with `QUICK`: the cost of an update."""
 
 
 def small(config: Config, **changes: Any) -> Config:
-    """`config` with the updates of `QUICK`, and further changes."""
+    """`config` with the small updates of `QUICK` and further changes."""
     taken = {name: getattr(QUICK, name) for name in SMALL}
     return dataclasses.replace(config, preset="quick", **taken | changes)
 
@@ -93,8 +93,8 @@ ATARI_PAPER = dataclasses.replace(
     video=VideoConfig(every=40_000),
     env=AtariConfig(),
 )
-"""100,000 agent steps of 4 frames each; the warm-up is 10,000 of them, since the paper's text
-calls the agent's steps training steps. The train ratio is the official code's."""
+"""100,000 agent steps of 4 frames. The warm-up is 10,000 agent steps, which is what the paper
+calls training steps. The train ratio is the official code's."""
 
 ATARI_QUICK = small(
     ATARI_PAPER,
@@ -126,7 +126,7 @@ GYMNASIUM_PIXELS = dataclasses.replace(
     value_alignment=ValueAlignmentConfig(warmup_steps=960),
     video=VideoConfig(every=4_000),
 )
-"""As quick, for images: an update takes several times as long, so there are fewer."""
+"""Like quick, for images: fewer updates, since each takes several times as long."""
 
 STORM = Config(
     suite="atari100k",
@@ -163,8 +163,8 @@ STORM = Config(
     video=VideoConfig(every=40_000),
     env=AtariConfig(resize="area", noops=0, sticky=0.25, life_loss="terminal"),
 )
-"""STORM as its official code has it: 102,000 agent steps of 4 frames, of which the first 1,024
-are random; one update of everything for each. Table 14, and what it leaves out."""
+"""STORM as in its official code and Table 14: 102,000 agent steps of 4 frames, the first 1,024
+with random actions, and one update for every step."""
 
 STORM_QUICK = dataclasses.replace(
     with_widths(STORM, "1m", STORM_SIZES["1m"]._asdict()),
@@ -189,17 +189,17 @@ STORM_QUICK = dataclasses.replace(
     video=VideoConfig(),
     env=EnvConfig(),
 )
-"""For a CPU with 2 cores, as `QUICK`; the paper has no STORM that reads vectors."""
+"""Like `QUICK`, for a CPU with 2 cores. In the paper STORM reads images only."""
 
 
 def small_storm(like: Config) -> Config:
-    """STORM's small updates, in the run that `like` is for DreamerV3."""
+    """`like`, a run of DreamerV3, with STORM and its small updates instead."""
     taken = ("agent", "size", "world_model", "actor", "critic", "imagination", "optimizer")
     return dataclasses.replace(like, **{name: getattr(STORM_QUICK, name) for name in taken})
 
 
 def vagram(like: Config) -> Config:
-    """A deterministic world model and VaGraM, in the run that `like` is for DreamerV3."""
+    """`like`, a run of DreamerV3, with a deterministic world model and VaGraM instead."""
     return dataclasses.replace(
         like,
         agent="vagram",
