@@ -46,7 +46,7 @@ class WorldModelConfig:
     """state: applies to the KL of each state; batch: to the mean KL of the batch, so that below
     it no state has a gradient"""
     continue_target: Literal["discounted", "plain"] = "discounted"
-    """target of the continue head while an episode continues: gamma (discounted) or 1 (plain)"""
+    """target of the continue head inside an episode: gamma (discounted) or 1 (plain)"""
     reconstruction_scale: float = 1.0
     dynamics_scale: float = 1.0
     representation_scale: float = 0.1
@@ -85,8 +85,8 @@ class RSSMConfig(HeadsConfig):
 class VagramConfig(RSSMConfig):
     """A deterministic RSSM trained by the value's gradient (VaGraM) instead of the KL.
 
-    z holds probabilities instead of samples. VaGraM trains the prior. VaGraM, the reward, continue
-    and replay value losses train the latents.
+    z holds probabilities instead of samples. VaGraM trains the prior. VaGraM, the reward,
+    continue and replay value losses train the latents.
     """
 
     dynamics_scale: float = 0.0
@@ -176,8 +176,8 @@ class CriticConfig:
     slow_scale: float = 1.0
     """weight of the slow critic's target"""
     slow_target: Literal["value", "returns"] = "value"
-    """second target. value: the slow critic's value, as in DreamerV3; returns: lambda-returns of
-    its values, as in STORM's official code"""
+    """second target. value: the slow critic's value, as in DreamerV3; returns: lambda-returns
+    of its values, as in STORM's official code"""
     replay_scale: float = 0.3
     """weight of the replay value loss"""
     replay_gradient: bool = True
@@ -189,8 +189,8 @@ class ImaginationConfig:
     horizon: int = 15
     """imagined steps"""
     starts: Literal["posteriors", "contexts"] = "posteriors"
-    """posteriors: imagination starts at every inferred state of the batch; contexts: at the states
-    predicted after separately drawn contexts"""
+    """posteriors: imagination starts at every inferred state of the batch; contexts: at the
+    states predicted after separately drawn contexts"""
     batch_size: int = 1024
     """contexts drawn for one update"""
     context_length: int = 8
@@ -220,7 +220,7 @@ class ValueAlignmentConfig:
     static_weight: float = 0.5
     """the weight after the warm-up with weight="static"; Table 3"""
     warmup_steps: int = 10_000
-    """the weight is 0 up to and including this step; in small presets it scales with --env-steps"""
+    """the weight is 0 up to and including this step; small presets scale it with --env-steps"""
     warmup_unit: Literal["env_steps", "updates"] = "env_steps"
     """what warmup_steps counts"""
     dynamics_scale: float = 0.5
@@ -258,8 +258,8 @@ class LaPropConfig(OptimizerConfig):
 class AdamConfig(OptimizerConfig):
     """Two Adams: one for the world model, then one for actor and critic in the new world model.
 
-    Each clips by the global norm of its gradient first. Numbers of Table 14; both epsilons are the
-    official code's.
+    Each clips by the global norm of its gradient first. Numbers of Table 14; both epsilons are
+    the official code's.
     """
 
     learning_rate: float = 1e-4

@@ -45,11 +45,11 @@ QUICK = dataclasses.replace(
     optimizer=LaPropConfig(learning_rate=6e-4, warmup_updates=300),
     replay=ReplayConfig(batch_size=8, batch_length=32),
 )
-"""For a CPU with 2 cores, where simulation is cheap and updates are expensive: few small updates
-with a high learning rate, and an action repeat of 4."""
+"""For a CPU with 2 cores, where simulation is cheap and updates are expensive: few small
+updates with a high learning rate, and an action repeat of 4."""
 
 SMALL = ("size", "world_model", "actor", "critic", "imagination", "optimizer", "replay")
-"""Fields that the small presets of the other suites share with `QUICK`: the cost of an update."""
+"""Fields that small presets of the other suites share with `QUICK`: what an update costs."""
 
 
 def small(config: Config, **changes: Any) -> Config:
