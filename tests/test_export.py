@@ -73,7 +73,7 @@ def test_the_weights_come_back_bit_for_bit(logdir, exported):
 ACT = """
 import pathlib, sys
 import jax, numpy as np, vawm
-from vawm import cache
+from vawm.process import cache
 from vawm.types import TimeStep
 
 cache.enable()

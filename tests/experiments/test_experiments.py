@@ -107,7 +107,7 @@ def test_the_benchmark_prints_one_object_of_medians(capsys, monkeypatch):
 
 
 def test_a_benchmark_that_does_not_fit_is_refused(capsys, monkeypatch):
-    monkeypatch.setattr(benchmark.memory, "available_bytes", lambda: 2**30)
+    monkeypatch.setattr(benchmark.budget, "available_bytes", lambda: 2**30)
     monkeypatch.setattr(benchmark.jax.config, "update", lambda *_: None)  # the cache stays on
     assert command_line.guard(lambda: benchmark.main(["--size", "400m"])) == 2
     output = capsys.readouterr()

@@ -169,7 +169,9 @@ def test_metrics_that_are_not_kept_are_not_computed(monkeypatch):
     assert list(metrics) == ["kept"]
 
     monkeypatch.setattr(
-        host_train.learn, "make_update_at", lambda *_: lambda learner, buffer, *_: two(0, 0)
+        host_train.from_replay,
+        "make_update_at",
+        lambda *_: lambda learner, buffer, *_: two(0, 0),
     )
     update = host_train._make_update(None, tiny.CONFIG, lambda name: name == "kept")
     key = host_train.jax.random.key(0)
