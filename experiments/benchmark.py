@@ -46,7 +46,8 @@ from vawm.learning.collector import make_collect
 from vawm.learning.from_replay import Draw
 from vawm.learning.update import init_learner, make_update
 from vawm.process import huge_pages
-from vawm.runs import budget, suites, validate
+from vawm.runs import budget, validate
+from vawm.runs.suites import dmc_vision
 from vawm.sweep.overhead import peak_process_bytes, percent_more, quartiles
 from vawm.types import Batch, EnvSpec, Trajectory, image, vector
 from vawm.world_model.codecs import check_image_size
@@ -224,7 +225,7 @@ def frames_per_s(options: Benchmark, config: Config) -> dict[str, float]:
     act, measured = None, {}
     for workers in (1, 2, 3, 4):
         many = dataclasses.replace(choices, workers=workers)
-        with contextlib.closing(suites.on_host(config, many)) as environments:
+        with contextlib.closing(dmc_vision.make(config, many)) as environments:
             timestep = environments.reset(0)
             agent = make_agent(config, environments.spec)
             acting, carry = agent.init(jax.random.key(0)), agent.initial(options.num_envs)

@@ -17,29 +17,16 @@ import pathlib
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
 
 from vawm.analysis.tables import write_csv
 from vawm.cli import command_line, flags
 from vawm.config import AgentName, ValueAlignmentConfig
-from vawm.runs import validate
+from vawm.runs import suites, validate
 from vawm.sweep import children, figures, results, runs
-from vawm.sweep.runs import PROGRAMS, Sweep, Variant
+from vawm.sweep.runs import Sweep, Variant
 
-
-class Experiment(NamedTuple):
-    """A program beside this one: its suite, and the tasks whose curves are usually wanted."""
-
-    suite: str
-    tasks: tuple[str, ...]
-
-
-EXPERIMENTS = {
-    "dmc_proprio": Experiment("dmc_proprio", ("cartpole_swingup", "cartpole_balance")),
-    "dmc_vision": Experiment("dmc_vision", ("cartpole_balance",)),
-    "atari100k": Experiment("atari100k", ("breakout",)),
-    "gymnasium_task": Experiment("gymnasium", ("vawm/GridWorld-v0",)),
-}
+EXPERIMENTS = {pathlib.Path(suite.program).stem: name for name, suite in suites.SUITES.items()}
+"""Name of a program beside this one -> the suite on which it trains."""
 FOLDER = pathlib.Path(__file__).resolve().parent
 
 
@@ -47,13 +34,11 @@ FOLDER = pathlib.Path(__file__).resolve().parent
 class Options:
     """Which runs, and where they go."""
 
-    experiment: Literal["dmc_proprio", "dmc_vision", "atari100k", "gymnasium_task"] = (
-        "dmc_proprio"
-    )
-    """the program that trains"""
+    experiment: str = "dmc_proprio"
+    """the program that trains: the name of a file beside this one, such as gymnasium_task"""
     agent: AgentName = "dreamerv3"
     tasks: tuple[str, ...] = ()
-    """as many as are named; the usual ones of the experiment if none"""
+    """any number of them; the usual ones of the suite if none"""
     seeds: tuple[int, ...] = (0, 1, 2)
     alignments: tuple[str, ...] = ("adaptive", "off")
     """values of --value-alignment.weight"""
@@ -69,7 +54,7 @@ class Options:
 
     @property
     def suite(self) -> str:
-        return EXPERIMENTS[self.experiment].suite
+        return EXPERIMENTS[self.experiment]
 
     @property
     def name(self) -> str:
@@ -83,14 +68,21 @@ class Options:
 
 
 def make_sweep(options: Options) -> Sweep:
+    """All runs.
+
+    Raises:
+      InvalidInput: there is no such experiment.
+    """
+    validate.check_choice("experiment", options.experiment, EXPERIMENTS)
+    suite = suites.SUITES[options.suite]
     return Sweep(
-        program=FOLDER / PROGRAMS[options.suite],
+        program=FOLDER / suite.program,
         folder=options.runs / options.name,
         variants=tuple(
             Variant(weight, ("--value-alignment.weight", weight))
             for weight in options.alignments
         ),
-        tasks=options.tasks or EXPERIMENTS[options.experiment].tasks,
+        tasks=options.tasks or suite.usual_tasks,
         seeds=options.seeds,
         flags=("--agent", options.agent, "--preset", options.preset),
         env_steps=options.env_steps,
@@ -121,7 +113,7 @@ def write(rows: results.Rows, options: Options, sweep: Sweep) -> None:
         sweep,
         options.result("png"),
         label="value alignment {}",
-        returns=(0, 1000) if options.suite.startswith("dmc") else None,
+        returns=suites.SUITES[options.suite].returns,
     )
 
 

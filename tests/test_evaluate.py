@@ -1,5 +1,6 @@
 """Scores: whole episodes, each counted once, and raw actions in the actuator's range."""
 
+import dataclasses
 import math
 
 import jax
@@ -8,23 +9,24 @@ import numpy as np
 import pytest
 import tiny
 
-from vawm import evaluate
+from vawm import config as config_lib
+from vawm import evaluate, presets
 from vawm.agent import make_agent
 from vawm.envs import probes
 from vawm.errors import InvalidInput
 from vawm.learning import train
 from vawm.policy import Policy, play, policy
 from vawm.policy.play import Score
-from vawm.runs import checkpoint
+from vawm.runs import checkpoint, suites
 from vawm.types import EnvSpec, vector
 
 CARTPOLE = EnvSpec("cartpole_balance", vector(5), 1, False, 2, 5, 200)
 
 
-def scripted(spec, action):
+def scripted(spec, action, config=tiny.CONFIG):
     """A policy that always does the same."""
     return Policy(
-        config=tiny.CONFIG,
+        config=config,
         spec=spec,
         env_steps=0,
         params=None,
@@ -64,13 +66,110 @@ def test_the_seed_decides():
 
 def test_no_episodes_are_refused():
     with pytest.raises(InvalidInput, match="episodes=0: use a whole number of at least 1"):
-        evaluate.dmc_proprio(scripted(CARTPOLE, 0.0), episodes=0)
+        evaluate.by_protocol(scripted(CARTPOLE, 0.0), episodes=0)
 
 
-@pytest.mark.parametrize("suite", ["dmc_vision", "atari100k", "gymnasium"])
-def test_a_policy_is_evaluated_by_the_protocol_of_its_suite(suite):
-    with pytest.raises(InvalidInput, match=r"policy='trained in dmc_proprio': .*dmc_proprio$"):
-        evaluate.PROTOCOLS[suite](scripted(CARTPOLE, 0.0))
+def quick(suite):
+    return presets.DREAMERV3[suite]["quick"]
+
+
+@pytest.mark.parametrize(
+    ("suite", "episodes", "num_envs", "changes"),
+    [
+        ("dmc_proprio", 10, 10, {}),
+        ("dmc_vision", 10, 8, {}),
+        ("atari100k", 100, 8, {"sticky": 0.0, "life_loss": "ignore", "clip_reward": False}),
+        ("gymnasium", 20, 8, {}),
+    ],
+)
+def test_a_policy_is_evaluated_by_the_protocol_of_its_suite(
+    suite, episodes, num_envs, changes, monkeypatch
+):
+    """In the environments of its own config, but for what the protocol changes."""
+    config, made, played = quick(suite), [], []
+    if suite == "atari100k":
+        other = {"sticky": 0.25, "life_loss": "end", "clip_reward": True}
+        config = dataclasses.replace(config, env=config_lib.AtariConfig(**other))
+    if suite != "dmc_proprio":
+        changes = changes | {"on_failure": "raise"}
+    env = tiny.env()
+
+    def make(config):
+        made.append(config)
+        return env
+
+    def play(policy, *, episodes, env, how, seed):
+        played.append((episodes, env, how, seed))
+        return Score((1.0,))
+
+    monkeypatch.setattr(evaluate.suites, "make", make)
+    monkeypatch.setattr(evaluate, "evaluate", play)
+    policy = scripted(env.spec, 0.0, config)
+    assert evaluate.by_protocol(policy) == Score((1.0,))
+    evaluate.by_protocol(policy, episodes=3, how="mode", seed=7)
+    assert played == [(episodes, env, "sample", 0), (3, env, "mode", 7)]
+    choices = dataclasses.replace(config.env, **changes)
+    assert made == [dataclasses.replace(config, num_envs=n, env=choices) for n in (num_envs, 3)]
+
+
+def test_only_what_a_protocol_has_can_be_chosen(monkeypatch):
+    made = []
+    monkeypatch.setattr(
+        evaluate.suites, "make", lambda config: made.append(config) or tiny.env()
+    )
+    monkeypatch.setattr(evaluate, "evaluate", lambda *_, **__: Score((1.0,)))
+    atari = scripted(tiny.env().spec, 0.0, quick("atari100k"))
+    evaluate.by_protocol(atari, sticky=0.25)
+    assert made[0].env.sticky == 0.25
+    for suite, options in [
+        ("atari100k", {"life_loss": "end"}),
+        ("atari100k", {"physics": "mjx"}),
+        ("gymnasium", {"sticky": 0.25}),
+        ("dmc_vision", {"physics": "mujoco"}),
+        ("dmc_proprio", {"physics": "bullet"}),
+        ("dmc_proprio", {"sticky": 0.0}),
+    ]:
+        ((name, value),) = options.items()
+        with pytest.raises(InvalidInput) as refusal:
+            evaluate.by_protocol(atari._replace(config=quick(suite)), **options)
+        assert (refusal.value.field, refusal.value.value) == (name, value)
+    assert len(made) == 1
+
+
+@pytest.mark.parametrize("physics", [None, "mjx", "mujoco"])
+def test_a_policy_of_an_environment_of_ones_own_has_no_protocol(physics):
+    """Its config names a task in which it was not trained."""
+    config = tiny.config(task="cartpole_balance")
+    policy = scripted(CARTPOLE._replace(task="my_own"), 0.0, config)
+    with pytest.raises(InvalidInput, match="task='my_own': "):
+        evaluate.by_protocol(policy, episodes=2, physics=physics)
+
+
+def test_environments_on_the_host_are_closed_after_playing(monkeypatch):
+    closed = []
+
+    class Host:
+        spec = tiny.env().spec
+
+        def close(self):
+            closed.append(True)
+
+    def fail(*_, **__):
+        raise InvalidInput("episodes", 1, "for the sake of this test")
+
+    monkeypatch.setattr(evaluate.suites, "make", lambda _: Host())
+    monkeypatch.setattr(evaluate, "evaluate", fail)
+    with pytest.raises(InvalidInput):
+        evaluate.by_protocol(scripted(Host.spec, 0.0, quick("gymnasium")))
+    assert closed == [True]
+
+
+def test_help_has_the_protocol_of_every_suite():
+    lines = evaluate.description().splitlines()
+    for name, suite in suites.SUITES.items():
+        (line,) = [line for line in lines if line.split()[:1] == [name]]
+        assert line.split()[1] == str(suite.protocol.episodes)
+        assert line.endswith(suite.protocol.text)
 
 
 def test_environments_of_another_kind_are_refused():
@@ -82,11 +181,11 @@ def test_environments_of_another_kind_are_refused():
 
 def test_the_same_policy_plays_in_the_simulation_of_dm_control():
     """Still, a cartpole that starts upright falls within seconds: a middling return."""
-    still = evaluate.dmc_proprio(scripted(CARTPOLE, 0.0), episodes=2, physics="mujoco")
+    still = evaluate.by_protocol(scripted(CARTPOLE, 0.0), episodes=2, physics="mujoco")
     assert all(100 < total < 900 for total in still.returns)
-    again = evaluate.dmc_proprio(scripted(CARTPOLE, 0.0), episodes=2, physics="mujoco")
+    again = evaluate.by_protocol(scripted(CARTPOLE, 0.0), episodes=2, physics="mujoco")
     assert again == still
-    pushed = evaluate.dmc_proprio(scripted(CARTPOLE, 5.0), episodes=2, physics="mujoco")
+    pushed = evaluate.by_protocol(scripted(CARTPOLE, 5.0), episodes=2, physics="mujoco")
     assert pushed.mean < still.mean
 
 
@@ -132,7 +231,7 @@ def test_the_command_line_reports_each_simulation(saved, monkeypatch, capsys):
         asked.append(kwargs)
         return Score((1.0, 3.0))
 
-    monkeypatch.setitem(evaluate.PROTOCOLS, "dmc_proprio", fake)
+    monkeypatch.setattr(evaluate, "by_protocol", fake)
     monkeypatch.setattr(evaluate.cache, "enable", lambda: None)
     arguments = ["--logdir", str(saved[0]), "--episodes", "2", "--physics", "mujoco"]
     assert evaluate.main(arguments) == 0
@@ -164,4 +263,4 @@ def test_bad_input_is_one_line_and_code_2(tmp_path, capsys, monkeypatch, flags, 
 @pytest.mark.parametrize("seed", [-1, 2**31])
 def test_an_impossible_seed_is_refused(seed):
     with pytest.raises(InvalidInput, match="seed="):
-        evaluate.dmc_proprio(scripted(CARTPOLE, 0.0), episodes=1, seed=seed)
+        evaluate.by_protocol(scripted(CARTPOLE, 0.0), episodes=1, seed=seed)

@@ -382,7 +382,7 @@ def test_the_command_line_evaluates_and_exports(logdir, tmp_path, monkeypatch, c
         checkpoint.save(logdir, newer, env_steps=40, **usual)
         return Score((1.0, 3.0))
 
-    monkeypatch.setitem(evaluate.PROTOCOLS, "dmc_proprio", fake)
+    monkeypatch.setattr(evaluate, "by_protocol", fake)
     monkeypatch.setattr(export.cache, "enable", lambda: None)
     words = ["--logdir", str(logdir), "--output", str(tmp_path / "policy")]
     assert export.main([*words, "--episodes", "2", "--seed", "5"]) == 0

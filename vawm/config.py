@@ -369,15 +369,6 @@ class GymnasiumConfig(HostEnvConfig):
     """steps after which an episode is truncated; 0 for the environment's own limit"""
 
 
-ENV_CONFIGS: dict[str, type[EnvConfig]] = {
-    "dmc_proprio": EnvConfig,
-    "dmc_vision": VisionConfig,
-    "atari100k": AtariConfig,
-    "gymnasium": GymnasiumConfig,
-}
-"""Suite -> what can be chosen of its environments."""
-
-
 AgentName = Annotated[str, "a name in vawm.agent.registry"]
 """Which agent: the programs offer those that are registered."""
 
@@ -386,8 +377,8 @@ AgentName = Annotated[str, "a name in vawm.agent.registry"]
 class Config:
     """One run. `env_steps` counts control steps, action repeat included."""
 
-    suite: Literal["dmc_proprio", "dmc_vision", "atari100k", "gymnasium"] = "dmc_proprio"
-    """where the task is from"""
+    suite: str = "dmc_proprio"
+    """of the task, such as dmc_vision; `vawm.runs.suites` has them all"""
     task: str = "cartpole_swingup"
     """name of the environment in its suite"""
     agent: AgentName = "dreamerv3"

@@ -1,15 +1,12 @@
-"""Scores of a trained policy: one named protocol per suite, and the command line.
+"""Scores of a trained policy, by the protocol of its suite; and the command line.
 
     python -m vawm.evaluate --logdir runs/...
 
-    dmc_proprio   10 episodes, on MJX or in dm_control's own simulation
-    dmc_vision    10 episodes
-    atari100k     100 games to their end, whole scores, no sticky actions; human-normalised
-    gymnasium     20 episodes
+Actions are sampled from the policy, as in the official DreamerV3, at temperature 1 even if the
+policy collected at another one; `how="mode"` takes its mode. How many episodes count is decided
+before they begin, and each counts once. On the host, no episode of training is played again.
 
-Actions are sampled from the policy, as in the official DreamerV3, whatever the temperature it
-collected with; `how="mode"` takes its mode. Every episode that is begun to be counted is
-counted, once. On the host, none of them is an episode that the run was trained on.
+The protocol is part of the record of a suite, see `vawm.runs.suites`.
 """
 
 from __future__ import annotations
@@ -18,7 +15,7 @@ import contextlib
 import dataclasses
 import pathlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, Literal
 
 import jax
@@ -26,11 +23,10 @@ import jax
 from vawm import envs
 from vawm.cli import flags
 from vawm.cli.command_line import guard
-from vawm.config import HostEnvConfig
+from vawm.config import Config
 from vawm.envs.protocol import Environment, HostEnvironment, check_positive
 from vawm.errors import InvalidInput
-from vawm.policy import Policy, play, scores
-from vawm.policy import policy as policy_lib
+from vawm.policy import Policy, load, play, scores
 from vawm.policy.play import How, Score
 from vawm.process import cache, huge_pages
 from vawm.runs import suites
@@ -50,15 +46,15 @@ def evaluate(
     """Plays `episodes` whole episodes in any environments.
 
     Args:
-      policy: what `vawm.load` returns.
-      episodes: a jittable environment plays them side by side, with `num_envs == episodes`.
-      env: what to play in; one on the host stays open.
-      how: actions are sampled, or the policy's mode.
+      policy: as `vawm.load` returns it.
+      episodes: how many; a jittable environment needs `num_envs == episodes`.
+      env: where to play; one on the host is not closed.
+      how: sample actions from the policy, or take its mode.
       seed: of the episodes and of the actions.
 
     Raises:
-      InvalidInput: a number of episodes that is not positive, an impossible seed, or
-        environments of another kind than the policy's.
+      InvalidInput: the number of episodes is not positive, the seed is out of range, or the
+        environments do not fit the policy.
       EnvironmentFailure: an environment on the host failed.
     """
     check(episodes, seed)
@@ -66,14 +62,14 @@ def evaluate(
     if not isinstance(env, Environment):
         return play.on_host(env, policy, episodes=episodes, seed=seed, how=how)
     if env.spec.num_envs != episodes:
-        remedy = f"the environments are {env.spec.num_envs}, one for each; use that"
+        remedy = f"must equal the number of environments; use {env.spec.num_envs}"
         raise InvalidInput("episodes", episodes, remedy)
     returns = play.player(env, policy, how)(policy.params, policy.state, jax.random.key(seed))
     return Score(tuple(map(float, returns)))
 
 
 def check(episodes: int, seed: int) -> None:
-    """Refuses what cannot be played.
+    """Refuses a number of episodes or a seed that is out of range.
 
     Raises:
       InvalidInput: names the number and the remedy.
@@ -95,86 +91,81 @@ def check_env(policy: Policy, env: Environment | HostEnvironment) -> None:
             raise InvalidInput("env", f"{name} {theirs}", f"the policy was trained with {own}")
 
 
-def check_suite(policy: Policy, suite: str) -> None:
-    """Refuses a policy that was trained in another suite.
+def by_protocol(
+    policy: Policy,
+    *,
+    episodes: int | None = None,
+    how: How = "sample",
+    seed: int = 0,
+    physics: str | None = None,
+    **choices: Any,
+) -> Score:
+    """Plays by the protocol of the suite in which the policy was trained.
+
+    Args:
+      policy: as `vawm.load` returns it.
+      episodes: how many; as many as the protocol says if None.
+      how: sample actions from the policy, or take its mode.
+      seed: of the episodes and of the actions.
+      physics: one of `Protocol.physics`; that of training if None.
+      **choices: of the environments, those in `Protocol.options`, such as `sticky=0.25` for
+        Atari.
 
     Raises:
-      InvalidInput: names the protocol of its own.
+      InvalidInput: a number is out of range, the protocol does not have this option, or the
+        policy was trained in an environment that its config does not name.
+      EnvironmentFailure: an environment on the host failed.
     """
-    own = policy.config.suite
-    if own != suite:
-        remedy = f"use the protocol of its own suite, evaluate.{own}"
-        raise InvalidInput("policy", f"trained in {own}", remedy)
-
-
-def dmc_proprio(
-    policy: Policy,
-    *,
-    episodes: int = 10,
-    physics: Literal["mjx", "mujoco"] = "mjx",
-    how: How = "sample",
-    seed: int = 0,
-) -> Score:
-    """Episodes of 1000 control steps, in the simulation of training or in dm_control's."""
+    protocol = suites.of(policy.config).protocol
+    episodes = protocol.episodes if episodes is None else episodes
     check(episodes, seed)
-    check_suite(policy, "dmc_proprio")
+    check_options(policy.config.suite, physics=physics, **choices)
     if physics == "mujoco":
+        envs.check_task(policy.spec.task)
         return play.in_mujoco(policy, episodes=episodes, seed=seed, how=how)
-    spec = policy.spec
-    env = envs.make(spec.task, num_envs=episodes, action_repeat=spec.action_repeat)
-    return evaluate(policy, episodes=episodes, env=env, how=how, seed=seed)
-
-
-def dmc_vision(
-    policy: Policy, *, episodes: int = 10, how: How = "sample", seed: int = 0
-) -> Score:
-    """Episodes of 1000 control steps, rendered as in training."""
-    check_suite(policy, "dmc_vision")
-    return _on_host(policy, episodes=episodes, how=how, seed=seed)
-
-
-def atari100k(
-    policy: Policy,
-    *,
-    episodes: int = 100,
-    how: How = "sample",
-    sticky: float = 0.0,
-    seed: int = 0,
-) -> Score:
-    """Whole games with their whole scores, whatever the training called an end or clipped.
-
-    Frames, no-ops and the length limit are those of training; sticky actions are off unless
-    `sticky` is their probability.
-    """
-    check_suite(policy, "atari100k")
-    changes = {"sticky": sticky, "life_loss": "ignore", "clip_reward": False}
-    return _on_host(policy, episodes=episodes, how=how, seed=seed, **changes)
-
-
-def gymnasium(
-    policy: Policy, *, episodes: int = 20, how: How = "sample", seed: int = 0
-) -> Score:
-    """Episodes of a registered environment."""
-    check_suite(policy, "gymnasium")
-    return _on_host(policy, episodes=episodes, how=how, seed=seed)
-
-
-PROTOCOLS = {
-    "dmc_proprio": dmc_proprio,
-    "dmc_vision": dmc_vision,
-    "atari100k": atari100k,
-    "gymnasium": gymnasium,
-}
-
-
-def _on_host(policy: Policy, *, episodes: int, how: How, seed: int, **changes: Any) -> Score:
-    """In the environments of the policy's own config, with some of its choices changed."""
-    check(episodes, seed)
-    assert isinstance(policy.config.env, HostEnvConfig)
-    choices = dataclasses.replace(policy.config.env, on_failure="raise", **changes)
-    config = dataclasses.replace(policy.config, num_envs=min(episodes, AT_ONCE), env=choices)
-    with contextlib.closing(suites.on_host(config, choices)) as env:
+    changes = {**protocol.changes, **choices}
+    with environments(policy.config, episodes, **changes) as env:
+        if env.spec.task != policy.spec.task:
+            remedy = f"is not the config's task, {env.spec.task}; use evaluate(..., env=...)"
+            raise InvalidInput("task", policy.spec.task, remedy)
         return evaluate(policy, episodes=episodes, env=env, how=how, seed=seed)
+
+
+def check_options(suite: str, *, physics: str | None = None, **choices: Any) -> None:
+    """Refuses what the protocol of a suite does not let the caller choose.
+
+    Raises:
+      InvalidInput: names the option.
+    """
+    protocol = suites.SUITES[suite].protocol
+    if physics is not None and physics not in protocol.physics:
+        raise InvalidInput("physics", physics, f"is not an option of {suite}")
+    for name, value in choices.items():
+        if name not in protocol.options:
+            raise InvalidInput(name, value, f"is not an option of {suite}")
+
+
+@contextlib.contextmanager
+def environments(
+    config: Config, episodes: int, **changes: Any
+) -> Iterator[Environment | HostEnvironment]:
+    """The environments of a run, as many as `episodes` need; on the host at most `AT_ONCE`.
+
+    Args:
+      config: of the run.
+      episodes: how many will be played.
+      **changes: choices of the environments that differ from those of training.
+    """
+    num_envs = episodes
+    if suites.host_choices(config) is not None:
+        num_envs, changes = min(episodes, AT_ONCE), changes | {"on_failure": "raise"}
+    choices = dataclasses.replace(config.env, **changes)
+    env = suites.make(dataclasses.replace(config, num_envs=num_envs, env=choices))
+    try:
+        yield env
+    finally:
+        if not isinstance(env, Environment):
+            env.close()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -184,56 +175,71 @@ class Arguments:
     logdir: pathlib.Path
     """folder of the run"""
     episodes: int | None = None
-    """as many as the protocol has if not given"""
+    """how many; as many as the protocol says if not given"""
     how: Literal["sample", "mode"] = "sample"
     """sample actions from the policy, or take its mode"""
     physics: Literal["mjx", "mujoco"] = "mjx"
-    """mujoco: also in dm_control's own C simulation; for dmc_proprio"""
+    """mujoco: play in dm_control's own C simulation too; for dmc_proprio"""
     sticky: float = 0.0
     """probability of sticky actions; for atari100k"""
     seed: int = 0
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Prints a line per simulation; returns the exit code."""
-    arguments = flags.read(Arguments, argv, description=__doc__)
+    """Prints the score, one line per physics engine; returns the exit code."""
+    arguments = flags.read(Arguments, argv, description=description())
     check(1 if arguments.episodes is None else arguments.episodes, arguments.seed)
     cache.enable()
-    policy = policy_lib.load(arguments.logdir)
+    policy = load(arguments.logdir)
     suite, task = policy.config.suite, policy.spec.task
     variants = _variants(arguments, suite)
     print(f"{task} ({suite}) at {policy.env_steps} env steps, mean +- standard error")
-    common: dict[str, Any] = {"how": arguments.how, "seed": arguments.seed}
-    if arguments.episodes is not None:
-        common["episodes"] = arguments.episodes
-    for name, choices in variants.items():
-        score = PROTOCOLS[suite](policy, **common, **choices)
-        text = f"  {name:6} {score}"
-        if suite == "atari100k":
-            normalized = scores.human_normalized(task, score.mean)
-            text += f", {normalized:.3f} human-normalised"
-        print(text, flush=True)
+    for name, options in variants.items():
+        score = by_protocol(
+            policy,
+            episodes=arguments.episodes,
+            how=arguments.how,
+            seed=arguments.seed,
+            **options,
+        )
+        print(f"  {name:6} {score}{_normalized(suite, task, score)}", flush=True)
     return 0
 
 
+def description() -> str:
+    """The help: what this module does, and the protocol of every suite."""
+    rows = [
+        f"    {name:12}{suite.protocol.episodes:4} {suite.protocol.text}"
+        for name, suite in suites.SUITES.items()
+    ]
+    return "\n".join(
+        [__doc__ or "", "The usual number of episodes, and what they are:", "", *rows]
+    )
+
+
 def _variants(arguments: Arguments, suite: str) -> dict[str, dict[str, Any]]:
-    """Name -> what its protocol is told besides the usual.
+    """Name of a line -> options of the protocol.
 
     Raises:
-      InvalidInput: an option that is not of this suite.
+      InvalidInput: the protocol of this suite does not have the option.
     """
-    if arguments.physics != "mjx" and suite != "dmc_proprio":
-        raise InvalidInput("physics", arguments.physics, f"is not an option of {suite}")
-    if arguments.sticky and suite != "atari100k":
-        raise InvalidInput("sticky", arguments.sticky, f"is not an option of {suite}")
+    options: dict[str, Any] = {"sticky": arguments.sticky} if arguments.sticky else {}
+    other = arguments.physics if arguments.physics != "mjx" else None
+    check_options(suite, physics=other, **options)
     if not 0 <= arguments.sticky < 1:
         raise InvalidInput("sticky", arguments.sticky, "use a number from 0 up to 1")
-    if suite == "atari100k":
-        return {"ale": {"sticky": arguments.sticky}}
-    if suite != "dmc_proprio":
-        return {arguments.how: {}}
-    simulations = ("mjx", "mujoco") if arguments.physics == "mujoco" else ("mjx",)
-    return {name: {"physics": name} for name in simulations}
+    engines = suites.SUITES[suite].protocol.physics[:1] + ((other,) if other else ())
+    if not engines:
+        return {arguments.how: options}
+    return {name: {"physics": name, **options} for name in engines}
+
+
+def _normalized(suite: str, task: str, score: Score) -> str:
+    """The human-normalised score, where there is one of a human."""
+    table = suites.SUITES[suite].human_table
+    if not table:
+        return ""
+    return f", {scores.human_normalized(task, score.mean, table=table):.3f} human-normalised"
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ from vawm import evaluate
 from vawm.agent import parameter_count
 from vawm.cli import flags
 from vawm.cli.command_line import guard
-from vawm.config import Config, HostEnvConfig
+from vawm.config import Config
 from vawm.errors import InvalidInput
 from vawm.policy import Policy, weights
 from vawm.policy import policy as policy_lib
@@ -35,15 +35,6 @@ from vawm.process import cache, huge_pages
 from vawm.runs import suites
 from vawm.runs.checkpoint import manifest as manifest_lib
 from vawm.runs.reports import tracking
-
-PROTOCOLS = {
-    "dmc_proprio": "whole episodes of 1000 control steps, simulated on MJX as in training",
-    "dmc_vision": "whole episodes of 1000 control steps, rendered as in training",
-    "atari100k": "whole games with their whole scores, without sticky actions",
-    "gymnasium": "whole episodes of the registered environment",
-}
-"""Suite -> what `vawm.evaluate` plays, for the model card."""
-
 
 LOAD = """\
 import jax, vawm
@@ -93,7 +84,7 @@ def export(
     policy = policy or policy_lib.load(logdir)
     measured = _last_return(logdir, policy.env_steps)
     if scores is not None:
-        protocol = protocol or f"{PROTOCOLS[policy.config.suite]}; actions sampled"
+        protocol = protocol or f"{suites.of(policy.config).protocol.text}; actions sampled"
         measured = f"Evaluation: return {scores} ({protocol}), mean +- standard error."
     weights.write(
         folder,
@@ -178,7 +169,7 @@ def _usage(policy: Policy) -> str:
         suites.check_task(dataclasses.replace(config, task=policy.spec.task))
     except InvalidInput:
         return OWN_USAGE
-    return HOST_USAGE if isinstance(config.env, HostEnvConfig) else USAGE
+    return USAGE if suites.host_choices(config) is None else HOST_USAGE
 
 
 def _alignment(config: Config, env_steps: int) -> str:
@@ -218,8 +209,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     policy, scores = policy_lib.load(arguments.logdir), None
     if arguments.episodes:
         cache.enable()
-        protocol = evaluate.PROTOCOLS[policy.config.suite]
-        scores = protocol(policy, episodes=arguments.episodes, seed=arguments.seed)
+        scores = evaluate.by_protocol(policy, episodes=arguments.episodes, seed=arguments.seed)
     folder = export(arguments.logdir, arguments.output, policy=policy, scores=scores)
     print(f"exported to {folder}" + (f", return {scores}" if scores else ""))
     print(f"evaluate with: python -m vawm.evaluate --logdir {folder}")

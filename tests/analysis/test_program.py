@@ -246,7 +246,7 @@ def pixels(folder):
     """The folder of a run from pixels, and episodes that its policy has played."""
     with pytest.MonkeyPatch.context() as patch:
         env = tiny_pixels.pool()
-        patch.setattr(analyse.episodes.suites, "make", lambda config: env)
+        patch.setattr(analyse.evaluate.suites, "make", lambda config: env)
         policy = make_policy(tiny_pixels.CONFIG, env.spec)
         record = analyse.episodes.record(policy, episodes=2, seed=0)
     return save_run(folder / "pixels", policy), record

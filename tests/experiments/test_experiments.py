@@ -47,6 +47,7 @@ gradient_routes = load("gradient_routes")
         (curves, ["--tasks", "walker_wlak"], "task='walker_wlak': did you mean"),
         (curves, ["--alignments", "of"], "alignments='of': did you mean 'off'"),
         (curves, ["--preset", "quik"], "preset='quik': did you mean 'quick'"),
+        (curves, ["--experiment", "gymnasium"], "experiment='gymnasium': "),
         (curves, ["--jobs", "0"], "jobs=0: use a whole number"),
         (curves, ["--env-steps", "0"], "env_steps=0: use a number above 0"),
         (curves, ["--seeds", "a"], "--seeds='a': use a whole number"),
@@ -54,7 +55,7 @@ gradient_routes = load("gradient_routes")
         (
             curves,
             ["--seeds", "1", "0", "1"],
-            "seeds=(1, 0, 1): use at least one, and each once",
+            "seeds=(1, 0, 1): ",
         ),
         (curves, ["--seeds"], "seeds=(): use at least one"),
         (curves, ["--alignments", "off", "off"], "alignments=('off', 'off'): use at least one"),

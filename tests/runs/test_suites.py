@@ -1,5 +1,6 @@
 """The command lines of the suites on the host, and the environments that a config names."""
 
+import ast
 import contextlib
 import dataclasses
 import importlib.util
@@ -7,20 +8,18 @@ import pathlib
 
 import pytest
 
-from vawm import presets
+import vawm
+from vawm import envs, presets
 from vawm.agent import registry
 from vawm.cli import command_line
+from vawm.envs.host import atari, vision
 from vawm.errors import InvalidInput
+from vawm.policy import scores
 from vawm.process import cache
 from vawm.runs import run_folder, runner, suites
 
 FOLDER = pathlib.Path(__file__).parents[2] / "experiments"
-PROGRAMS = {
-    "dmc_proprio": "dmc_proprio",
-    "dmc_vision": "dmc_vision",
-    "atari100k": "atari100k",
-    "gymnasium": "gymnasium_task",
-}
+PACKAGE = pathlib.Path(vawm.__file__).parent
 
 
 @pytest.fixture
@@ -38,8 +37,8 @@ def experiment(monkeypatch, tmp_path):
     monkeypatch.setattr(runner, "run", run)
 
     def main(suite, *flags):
-        path = FOLDER / f"{PROGRAMS[suite]}.py"
-        spec = importlib.util.spec_from_file_location(PROGRAMS[suite], path)
+        path = FOLDER / suites.SUITES[suite].program
+        spec = importlib.util.spec_from_file_location(path.stem, path)
         module = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(module)
         return command_line.guard(lambda: module.main(flags))
@@ -48,7 +47,7 @@ def experiment(monkeypatch, tmp_path):
     return main
 
 
-@pytest.mark.parametrize("suite", PROGRAMS)
+@pytest.mark.parametrize("suite", suites.SUITES)
 @pytest.mark.parametrize("agent", registry.names())
 def test_every_program_runs_its_suite_and_says_what_its_preset_is(
     experiment, suite, agent, capsys
@@ -132,16 +131,73 @@ def test_a_config_makes_the_environments_that_it_names():
     assert proprio.spec.task == "pendulum_swingup"
 
 
-def test_a_suite_without_a_simulator_is_a_mistake_of_ours():
-    with pytest.raises(TypeError, match="no simulator for GymnasiumConfig"):
-        suites.simulator(presets.GYMNASIUM_QUICK, presets.GYMNASIUM_QUICK.env)
+@pytest.mark.parametrize("name", suites.SUITES)
+def test_every_suite_has_a_whole_record(name):
+    suite = suites.SUITES[name]
+    assert (FOLDER / suite.program).exists()
+    assert suite.usual_tasks
+    for task in suite.usual_tasks:
+        suite.check_task(task)
+    kinds = {field.name: field.type for field in dataclasses.fields(suite.choices)}
+    assert all(kinds[number] in ("int", "float") for number in suite.rules)
+    protocol = suite.protocol
+    assert protocol.text
+    assert protocol.episodes > 0
+    assert protocol.changes.keys() <= kinds.keys()
+    assert set(protocol.options) <= protocol.changes.keys()
+    if suite.returns:
+        assert suite.returns[0] < suite.returns[1]
+    for config in presets.DREAMERV3[name].values():
+        assert suites.of(config) is suite
+        assert type(config.env) is suite.choices
+        assert (config.video.every > 0) <= suite.has_images
+        suites.check_task(config)
+
+
+def test_every_table_of_scores_is_of_one_suite_and_has_its_tasks():
+    named = [table for suite in suites.SUITES.values() for table in suite.tables]
+    assert sorted(named) == sorted(scores.TABLES)
+    for suite in suites.SUITES.values():
+        for table in suite.tables:
+            for row in scores.table(table):
+                suite.check_task(scores.snake_case(row))
+        if suite.human_table:
+            assert suite.human_table in suite.tables
+            for row in scores.table(suite.human_table).values():
+                assert {"random", "human"} <= row.keys()
+
+
+def test_only_records_and_presets_know_one_suite_from_another():
+    """No other module names a class of choices, or compares with the name of a suite."""
+    classes = {"AtariConfig", "VisionConfig", "GymnasiumConfig"}
+    for path in PACKAGE.rglob("*.py"):
+        name = path.relative_to(PACKAGE).as_posix()
+        if name in ("config.py", "presets.py") or name.startswith("runs/suites/"):
+            continue
+        nodes = list(ast.walk(ast.parse(path.read_text())))
+        assert not classes & {node.id for node in nodes if isinstance(node, ast.Name)}, name
+        compared = [
+            side
+            for node in nodes
+            if isinstance(node, ast.Compare)
+            for side in (node.left, *node.comparators)
+        ]
+        constants = {side.value for side in compared if isinstance(side, ast.Constant)}
+        assert not constants & suites.SUITES.keys(), name
+
+
+def test_only_suites_on_the_host_have_choices_of_processes():
+    own = {name: presets.DREAMERV3[name]["quick"] for name in suites.SUITES}
+    hosts = {name: suites.host_choices(config) for name, config in own.items()}
+    assert hosts.pop("dmc_proprio") is None
+    assert hosts == {name: own[name].env for name in hosts}
 
 
 def test_every_task_of_a_suite_is_known():
     for config, tasks, count in [
-        (presets.QUICK, suites.envs.TASKS, 18),
-        (presets.VISION_QUICK, suites.vision.VISION_TASKS, 20),
-        (presets.ATARI_QUICK, tuple(suites.atari.GAMES), 26),
+        (presets.QUICK, envs.TASKS, 18),
+        (presets.VISION_QUICK, vision.VISION_TASKS, 20),
+        (presets.ATARI_QUICK, tuple(atari.GAMES), 26),
     ]:
         assert len(tasks) == count
         for task in tasks:

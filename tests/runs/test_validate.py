@@ -11,7 +11,7 @@ from vawm import config as config_lib
 from vawm import presets
 from vawm.agent import registry, with_size
 from vawm.errors import InvalidInput
-from vawm.runs import validate
+from vawm.runs import suites, validate
 from vawm.types import image
 
 
@@ -34,8 +34,8 @@ def changed(name, value, config=tiny.CONFIG):
 OF_AGENTS = {agent: registry.kind(agent).presets for agent in registry.names()}
 PRESETS = [
     (agent, suite, name)
-    for agent, suites in OF_AGENTS.items()
-    for suite, own in suites.items()
+    for agent, of_suite in OF_AGENTS.items()
+    for suite, own in of_suite.items()
     for name in own
 ]
 AT_EVERY_SIZE = [
@@ -77,7 +77,7 @@ def quick(suite, agent="dreamerv3"):
 
 
 @pytest.mark.parametrize("agent", registry.names())
-@pytest.mark.parametrize("suite", config_lib.ENV_CONFIGS)
+@pytest.mark.parametrize("suite", suites.SUITES)
 def test_every_number_of_an_environment_is_checked(suite, agent):
     for name in numbers(quick(suite, agent)):
         if name.startswith("env."):
@@ -90,6 +90,8 @@ def test_every_rule_is_about_a_field():
         *(numbers(quick(suite, agent)) for agent, own in OF_AGENTS.items() for suite in own)
     )
     assert set(validate.RULES) <= names
+    for suite in suites.SUITES.values():
+        assert {f"env.{name}" for name in suite.rules} <= names
 
 
 @pytest.mark.parametrize(

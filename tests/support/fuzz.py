@@ -24,7 +24,7 @@ from vawm.agent import make_agent
 from vawm.config import Config
 from vawm.errors import InvalidInput
 from vawm.learning import train
-from vawm.runs import diagnosis, runner, validate
+from vawm.runs import diagnosis, runner, suites, validate
 from vawm.types import EnvSpec
 
 STEPS = 50  # of a config that does not come to its second update before
@@ -32,12 +32,12 @@ STEPS = 50  # of a config that does not come to its second update before
 PIXELS = {
     suite: tiny_pixels.config(
         suite=suite,
-        env=kind(workers=1),
+        env=record.choices(workers=1),
         action_repeat=4 if suite == "atari100k" else 1,
         env_steps=4 * tiny.CONFIG.env_steps,
     )
-    for suite, kind in config_lib.ENV_CONFIGS.items()
-    if issubclass(kind, config_lib.HostEnvConfig)
+    for suite, record in suites.SUITES.items()
+    if issubclass(record.choices, config_lib.HostEnvConfig)
 }
 """From images, in environments of every suite on the host."""
 BASES = {"dreamerv3": tiny.CONFIG, "storm": tiny_storm.CONFIG, "vagram": tiny_vagram.CONFIG}
@@ -104,7 +104,7 @@ def refusal(config: Config, folder: pathlib.Path) -> str:
     """Why `config` is refused, in one line that begins with the name of a choice; or ""."""
     try:
         runner.check(config, folder, resume=False, known_task=False)
-        on_device = config.suite == "dmc_proprio"
+        on_device = suites.host_choices(config) is None
         runner.prepare(config, tiny.env() if on_device else Nothing(config.action_repeat))
     except InvalidInput as error:
         if error.field not in NAMES or "\n" in str(error):

@@ -204,8 +204,8 @@ def kind(name: str) -> AgentKind:
 
 
 def presets_of(config: Config) -> Mapping[str, Config]:
-    """The presets of this agent in this suite, by name."""
-    return kind(config.agent).presets[config.suite]
+    """The presets of this agent in this suite, by name; none if it has none."""
+    return kind(config.agent).presets.get(config.suite, {})
 
 
 def with_size(config: Config, size: str) -> Config:

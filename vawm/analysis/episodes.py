@@ -11,8 +11,6 @@ what it would have, had it watched: `watched_by`.
 
 from __future__ import annotations
 
-import contextlib
-import dataclasses
 import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -23,12 +21,10 @@ import numpy as np
 
 from vawm import evaluate
 from vawm.agent import Agent, PolicyCarry, make_agent
-from vawm.config import HostEnvConfig
 from vawm.envs.protocol import Environment, HostEnvironment
 from vawm.errors import InvalidInput
 from vawm.policy import Policy
 from vawm.policy.play import FRESH, How
-from vawm.runs import suites
 from vawm.types import Batch, EnvSpec, Key, Params, PyTree, TimeStep, Trajectory
 
 
@@ -64,19 +60,8 @@ def record(policy: Policy, *, episodes: int, seed: int, how: How = "sample") -> 
       EnvironmentFailure: an environment on the host failed.
     """
     evaluate.check(episodes, seed)
-    config = policy.config
-    if not isinstance(config.env, HostEnvConfig):
-        env = suites.make(dataclasses.replace(config, num_envs=episodes))
+    with evaluate.environments(policy.config, episodes) as env:
         return record_in(env, policy, episodes=episodes, seed=seed, how=how)
-    config = dataclasses.replace(
-        config,
-        num_envs=min(episodes, evaluate.AT_ONCE),
-        env=dataclasses.replace(config.env, on_failure="raise"),
-    )
-    host = suites.make(config)
-    assert not isinstance(host, Environment)
-    with contextlib.closing(host):
-        return record_in(host, policy, episodes=episodes, seed=seed, how=how)
 
 
 def record_in(

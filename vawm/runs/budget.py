@@ -11,9 +11,10 @@ import jax
 
 from vawm.agent import registry
 from vawm.agent.registry import Activations
-from vawm.config import Config, HostEnvConfig, VisionConfig
+from vawm.config import Config, HostEnvConfig
 from vawm.envs.host.crew import cores
 from vawm.errors import InvalidInput
+from vawm.runs import suites
 from vawm.runs.checkpoint.manifest import leaf_info
 from vawm.types import ArraySpec, EnvSpec, PyTree, is_image
 
@@ -40,8 +41,6 @@ HOST_PROCESS_BYTES = 1800 * 2**20
 COMPILER_BYTES = 400 * 2**20  # of an accelerator's memory, for its context and programs
 WORKER_BYTES = 200 * 2**20
 """Of each process with environments, for imports: 100 MiB, 200 with dm_control."""
-RENDERER_BYTES = 70 * 2**20
-"""Of each environment that is rendered on a CPU, as `VisionSimulator` says."""
 WORKING_FACTOR = 4
 """Measured per counted activation: 0.7 GB at size 1m for a batch of 16 x 64, 3.3 times
 what `working_bytes` counts; rounded up."""
@@ -118,9 +117,9 @@ def estimate(state: PyTree, spec: EnvSpec, config: Config) -> tuple[Estimate, ..
         process=COMPILER_BYTES,
         copies=1,
     )
-    process = PROCESS_BYTES
-    if isinstance(config.env, HostEnvConfig):
-        process = HOST_PROCESS_BYTES + worker_bytes(config)
+    process, host = PROCESS_BYTES, suites.host_choices(config)
+    if host is not None:
+        process = HOST_PROCESS_BYTES + worker_bytes(config, host)
     if jax.default_backend() == "cpu":
         return (device._replace(images=images, process=process, copies=SAVING_COPIES),)
     # The state passes through the host's memory on its way to a checkpoint.
@@ -134,12 +133,10 @@ def process_bytes() -> int:
     return PROCESS_BYTES if jax.default_backend() == "cpu" else COMPILER_BYTES
 
 
-def worker_bytes(config: Config) -> int:
+def worker_bytes(config: Config, env: HostEnvConfig) -> int:
     """What the processes of environments on the host take."""
-    assert isinstance(config.env, HostEnvConfig)
-    workers = min(config.num_envs, config.env.workers or cores())
-    rendered = config.num_envs if isinstance(config.env, VisionConfig) else 0
-    return WORKER_BYTES * workers + RENDERER_BYTES * rendered
+    workers = min(config.num_envs, env.workers or cores())
+    return WORKER_BYTES * workers + suites.of(config).env_bytes * config.num_envs
 
 
 def nbytes(tree: PyTree) -> int:
@@ -304,7 +301,7 @@ def _too_large(need: Estimate, free: int, config: Config, smallest: int) -> Inva
 
 def _could_move(config: Config) -> bool:
     """Whether replay keeps images on the device that could be on the host."""
-    return isinstance(config.env, HostEnvConfig) and config.replay.images == "device"
+    return suites.host_choices(config) is not None and config.replay.images == "device"
 
 
 def readable(size: float) -> str:

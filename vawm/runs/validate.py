@@ -13,9 +13,7 @@ import jax
 
 from vawm import presets
 from vawm.agent import registry
-from vawm.config import CUSTOM, ENV_CONFIGS, AtariConfig, Config, VisionConfig, kinds
-from vawm.envs import EPISODE_STEPS
-from vawm.envs.host.frames import check_smaller
+from vawm.config import CUSTOM, Config, kinds
 from vawm.errors import (
     ABOVE_ONE,
     BELOW_ONE,
@@ -31,8 +29,8 @@ from vawm.errors import (
     Rule,
     suggestion,
 )
+from vawm.runs import suites
 from vawm.types import EnvSpec, is_image
-from vawm.world_model.codecs import check_image_size
 
 RULES: dict[str, Rule] = {
     "seed": (lambda x: 0 <= x < 2**32, "use a number from 0 to 4294967295"),
@@ -50,10 +48,6 @@ RULES: dict[str, Rule] = {
     "actor.unimix": BELOW_ONE,
     "actor.scale": NOT_NEGATIVE,
     "actor.entropy_scale": NOT_NEGATIVE,
-    "env.camera": (lambda x: x >= -1, "use the number of a camera, or -1 for the usual one"),
-    "env.noops": NOT_NEGATIVE,
-    "env.sticky": BELOW_ONE,
-    "env.time_limit": NOT_NEGATIVE,
     "env.workers": NOT_NEGATIVE,
     "critic.bins": BINS,
     "critic.scale": NOT_NEGATIVE,
@@ -77,7 +71,7 @@ RULES: dict[str, Rule] = {
     "video.every": NOT_NEGATIVE,
     "save_minutes": NOT_NEGATIVE,
 }
-"""Field -> what its number must be. Agents add rules; all others must be positive."""
+"""Field -> what its number must be; positive if not here. Agents and suites add their own."""
 
 KINDS = {bool: "True or False", str: "a text"}
 INT32 = 2**31  # whole numbers are counted with on the device, all but the seed
@@ -90,8 +84,9 @@ def check(config: Config) -> None:
       InvalidInput: names the first field that cannot work, its value and the remedy.
     """
     check_choice("agent", config.agent, registry.names())
-    own = registry.kind(config.agent).rules
-    rules = RULES | {f"world_model.{name}": rule for name, rule in own.items()}
+    check_choice("suite", config.suite, list(suites.SUITES))
+    _check_env_class(config)
+    rules = RULES | _own_rules(config)
     for name, value, kind in fields(config):
         if typing.get_origin(kind) is typing.Literal:
             check_choice(name, value, typing.get_args(kind))
@@ -158,6 +153,22 @@ def _check_together(config: Config) -> None:
     if scale.return_scale_low >= scale.return_scale_high:
         remedy = f"use less than imagination.return_scale_high={scale.return_scale_high}"
         raise InvalidInput("imagination.return_scale_low", scale.return_scale_low, remedy)
+
+
+def _check_env_class(config: Config) -> None:
+    """A suite has the choices of its own kind."""
+    kind = suites.of(config).choices
+    if type(config.env) is not kind:
+        remedy = f"suite {config.suite} takes a {kind.__name__}"
+        raise InvalidInput("env", type(config.env).__name__, remedy)
+
+
+def _own_rules(config: Config) -> dict[str, Rule]:
+    """The rules of the agent and of the suite."""
+    model, env = registry.kind(config.agent).rules, suites.of(config).rules
+    return {f"world_model.{name}": rule for name, rule in model.items()} | {
+        f"env.{name}": rule for name, rule in env.items()
+    }
 
 
 def _check_agent(config: Config) -> None:
@@ -305,34 +316,13 @@ def _check_counters(config: Config) -> None:
 
 
 def _check_env(config: Config) -> None:
-    """What a suite allows: its own choices, its action repeat, its images."""
-    kind = ENV_CONFIGS[config.suite]
-    if type(config.env) is not kind:
-        remedy = f"suite {config.suite} takes a {kind.__name__}"
-        raise InvalidInput("env", type(config.env).__name__, remedy)
-    repeat, sequence = config.action_repeat, config.replay.batch_length
-    if config.suite.startswith("dmc") and EPISODE_STEPS % repeat:
-        remedy = f"use a divisor of {EPISODE_STEPS}, the control steps of an episode"
-        raise InvalidInput("action_repeat", repeat, remedy)
-    if config.suite == "gymnasium" and repeat != 1:
-        remedy = "use 1: a Gymnasium environment repeats actions itself, or not at all"
-        raise InvalidInput("action_repeat", repeat, remedy)
-    if isinstance(config.env, AtariConfig) and config.env.pooling > repeat:
-        remedy = f"use at most action_repeat={repeat}, the frames of a step"
-        raise InvalidInput("env.pooling", config.env.pooling, remedy)
-    if config.suite.startswith("dmc") and config.actor.collect_temperature != 1.0:
-        remedy = "use 1: only discrete policies have one"
-        raise InvalidInput(
-            "actor.collect_temperature", config.actor.collect_temperature, remedy
-        )
-    if isinstance(config.env, AtariConfig) and config.env.resize == "area":
-        check_smaller("env.image_size", config.env.image_size)
-    if isinstance(config.env, AtariConfig | VisionConfig):
-        check_image_size("env.image_size", config.env.image_size)
+    """What the suite refuses, and what depends on whether it has images."""
+    suite, sequence = suites.of(config), config.replay.batch_length
+    suite.check(config, config.env)
     if config.video.every and config.video.context >= sequence:
         remedy = f"use less than replay.batch_length={sequence}, or nothing is left to predict"
         raise InvalidInput("video.context", config.video.context, remedy)
-    if config.suite == "dmc_proprio":
+    if not suite.has_images:
         check_images(config, present=False)
 
 

@@ -17,9 +17,9 @@ from typing import Literal, NamedTuple
 from vawm.agent import registry
 from vawm.analysis.tables import write_csv
 from vawm.cli import flags
-from vawm.runs import validate
+from vawm.runs import suites, validate
 from vawm.sweep import children, figures, results, runs
-from vawm.sweep.runs import PROGRAMS, Sweep, Variant
+from vawm.sweep.runs import Sweep, Variant
 
 
 class Scale(NamedTuple):
@@ -168,7 +168,7 @@ def make_sweep(ablation: Ablation, options: Options, programs: pathlib.Path) -> 
     scale = scale_of(ablation, options)
     validate.check_choice("agent", options.agent, registry.names())
     return Sweep(
-        program=programs / PROGRAMS[scale.suite],
+        program=programs / suites.SUITES[scale.suite].program,
         folder=options.runs / result_name(ablation, options),
         variants=ablation.variants(options.agent),
         tasks=options.tasks or scale.tasks,

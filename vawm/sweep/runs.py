@@ -19,14 +19,6 @@ from vawm.errors import InvalidInput
 from vawm.runs import checkpoint, resume, run_folder, suites, validate
 from vawm.sweep.children import Job
 
-PROGRAMS = {
-    "dmc_proprio": "dmc_proprio.py",
-    "dmc_vision": "dmc_vision.py",
-    "atari100k": "atari100k.py",
-    "gymnasium": "gymnasium_task.py",
-}
-"""Suite -> the program in `experiments` that trains on it."""
-
 
 class Variant(NamedTuple):
     """What is compared: its name, in tables and folders, and the flags that make it."""

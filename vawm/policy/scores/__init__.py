@@ -29,13 +29,9 @@ from typing import NamedTuple
 
 from vawm.errors import InvalidInput, suggestion
 
-TABLES = (
-    "atari100k",
-    "atari100k_dreamerv3",
-    "atari100k_storm",
-    "dmc_vision_1m",
-    "dmc_proprio_500k",
-)
+FILES = resources.files(__name__)
+TABLES = tuple(sorted(file.name[:-4] for file in FILES.iterdir() if file.name.endswith(".csv")))
+"""The names of all tables. The record of a suite names its own, see `vawm.runs.suites`."""
 
 
 class Game(NamedTuple):
@@ -79,7 +75,7 @@ def table(name: str) -> dict[str, dict[str, float]]:
     """
     if name not in TABLES:
         raise InvalidInput("table", name, remedy(name, TABLES))
-    text = resources.files(__name__).joinpath(f"{name}.csv").read_text(encoding="utf-8")
+    text = FILES.joinpath(f"{name}.csv").read_text(encoding="utf-8")
     header, *rows = csv.reader(text.splitlines())
     return {
         row[0]: {
@@ -91,17 +87,18 @@ def table(name: str) -> dict[str, dict[str, float]]:
     }
 
 
-def human_normalized(game: str, score: float) -> float:
+def human_normalized(game: str, score: float, *, table: str = "atari100k") -> float:
     """(score - random) / (human - random): 0 for random play, 1 for the human's.
 
     Args:
       game: as a task, "bank_heist", or as printed, "BankHeist".
       score: mean return of whole games, in the game's own points.
+      table: one with the columns `random` and `human`.
 
     Raises:
       InvalidInput: an unknown game, or a score that is not finite.
     """
-    _, random, human = find_game(game)
+    _, random, human = find_game(game, table)
     if not math.isfinite(score):
         raise InvalidInput(game, score, "a score has to be a finite number")
     return (score - random) / (human - random)
@@ -129,20 +126,20 @@ def aggregate(scores: Mapping[str, float]) -> Aggregate:
     )
 
 
-def find_game(name: str) -> Game:
-    """The game of either name; refuses others, with the nearest one."""
-    for task, game in games().items():
+def find_game(name: str, of: str = "atari100k") -> Game:
+    """The game of either name in a table; refuses others, with the nearest one."""
+    for task, game in games(of).items():
         if name in (task, game.name):
             return game
-    raise InvalidInput("game", name, remedy(name, games()))
+    raise InvalidInput("game", name, remedy(name, games(of)))
 
 
 @functools.cache
-def games() -> dict[str, Game]:
-    """The 26 games by the name of their task."""
+def games(of: str = "atari100k") -> dict[str, Game]:
+    """The games of a table by the name of their task."""
     return {
         snake_case(name): Game(name, row["random"], row["human"])
-        for name, row in table("atari100k").items()
+        for name, row in table(of).items()
     }
 
 

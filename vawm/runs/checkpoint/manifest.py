@@ -24,7 +24,7 @@ from vawm.agent import registry
 from vawm.agent.registry import UnknownAgent
 from vawm.config import Config
 from vawm.errors import InvalidInput
-from vawm.runs import validate
+from vawm.runs import suites, validate
 from vawm.types import ArraySpec, EnvSpec, PyTree
 
 SCHEMA = 2
@@ -172,11 +172,11 @@ def config_from_dict(content: dict[str, Any], cls: type = Config) -> Any:
     hints = dict(config_lib.kinds(cls))
     if cls is Config:
         suite = content["suite"]
-        if not isinstance(suite, str) or suite not in config_lib.ENV_CONFIGS:
+        if not isinstance(suite, str) or suite not in suites.SUITES:
             raise InvalidInput("Config.suite", suite, "is not known")
         row = registry.kind(_choice("Config.agent", content["agent"], str))
         hints |= {
-            "env": config_lib.ENV_CONFIGS[suite],
+            "env": suites.SUITES[suite].choices,
             "world_model": row.world_model,
             "optimizer": row.optimizer,
         }

@@ -1,0 +1,48 @@
+"""The DeepMind Control Suite from vectors, simulated on MJX: 18 tasks."""
+
+from __future__ import annotations
+
+from vawm import envs
+from vawm.config import Config, EnvConfig
+from vawm.envs.protocol import Environment
+from vawm.errors import InvalidInput
+from vawm.runs.suites.record import Protocol, Suite
+
+
+def check(config: Config, env: EnvConfig) -> None:
+    """Refuses an action repeat that does not divide an episode, and a temperature.
+
+    Raises:
+      InvalidInput: names the field and the remedy.
+    """
+    if envs.EPISODE_STEPS % config.action_repeat:
+        remedy = f"use a divisor of {envs.EPISODE_STEPS}, the control steps of an episode"
+        raise InvalidInput("action_repeat", config.action_repeat, remedy)
+    if config.actor.collect_temperature != 1.0:
+        remedy = "use 1: only discrete policies have a temperature"
+        raise InvalidInput(
+            "actor.collect_temperature", config.actor.collect_temperature, remedy
+        )
+
+
+def make(config: Config, env: EnvConfig) -> Environment:
+    """The environments of a run."""
+    return envs.make(config.task, num_envs=config.num_envs, action_repeat=config.action_repeat)
+
+
+SUITE = Suite(
+    choices=EnvConfig,
+    check=check,
+    check_task=envs.check_task,
+    make=make,
+    protocol=Protocol(
+        text="whole episodes of 1000 control steps, simulated on MJX as in training",
+        episodes=10,
+        physics=("mjx", "mujoco"),
+    ),
+    program="dmc_proprio.py",
+    usual_tasks=("cartpole_swingup", "cartpole_balance"),
+    tables=("dmc_proprio_500k",),
+    returns=(0.0, 1000.0),
+    has_images=False,
+)

@@ -1,0 +1,48 @@
+"""Any registered Gymnasium environment; the task is its id."""
+
+from __future__ import annotations
+
+from vawm.config import Config, GymnasiumConfig
+from vawm.envs.host import gymnasium
+from vawm.envs.host.pool import Pool
+from vawm.errors import NOT_NEGATIVE, InvalidInput
+from vawm.runs.suites.record import Protocol, Suite
+
+
+def check(config: Config, env: GymnasiumConfig) -> None:
+    """Refuses to repeat actions.
+
+    Raises:
+      InvalidInput: names the field and the remedy.
+    """
+    if config.action_repeat != 1:
+        remedy = "use 1: a Gymnasium environment repeats actions itself, or not at all"
+        raise InvalidInput("action_repeat", config.action_repeat, remedy)
+
+
+def make(config: Config, env: GymnasiumConfig) -> Pool:
+    """The environments of a run, in processes of their own.
+
+    Raises:
+      InvalidInput: also for all that does not fit in the environment, at once.
+    """
+    return gymnasium.from_gymnasium(
+        config.task,
+        num_envs=config.num_envs,
+        time_limit=env.time_limit or None,
+        workers=env.workers,
+        timeout=env.timeout,
+        on_failure=env.on_failure,
+    )
+
+
+SUITE = Suite(
+    choices=GymnasiumConfig,
+    rules={"time_limit": NOT_NEGATIVE},
+    check=check,
+    check_task=gymnasium.check_id,
+    make=make,
+    protocol=Protocol(text="whole episodes of the registered environment", episodes=20),
+    program="gymnasium_task.py",
+    usual_tasks=("vawm/GridWorld-v0",),
+)
