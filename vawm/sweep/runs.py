@@ -1,4 +1,4 @@
-"""Which runs a sweep has, the command of each, and whether it is finished."""
+"""The runs of a sweep, the command of each, and whether it is finished."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from vawm.sweep.children import Job
 
 
 class Variant(NamedTuple):
-    """What is compared: its name, in tables and folders, and the flags that make it."""
+    """One side of a comparison: its name in tables and folders, and its flags."""
 
     name: str
     flags: tuple[str, ...]
@@ -29,24 +29,24 @@ class Variant(NamedTuple):
 
 @dataclass(frozen=True)
 class Sweep:
-    """Runs that differ in variant, task and seed, and in nothing else."""
+    """Runs that differ only in variant, task and seed."""
 
     program: pathlib.Path
     """a program of `experiments`, or one that takes the same flags"""
     folder: pathlib.Path
-    """where the folders of the runs are"""
+    """parent of the folders of the runs"""
     variants: tuple[Variant, ...]
     tasks: tuple[str, ...]
     seeds: tuple[int, ...]
     flags: tuple[str, ...] = ()
-    """of every run, before those of its variant"""
+    """of all runs; those of a variant come after them"""
     env_steps: int | None = None
-    """length of every run; that of its preset if None"""
+    """length of a run; None for the length in its preset"""
 
 
 @dataclass(frozen=True)
 class Run:
-    """One of a sweep."""
+    """One run of a sweep."""
 
     task: str
     variant: str
@@ -57,33 +57,33 @@ class Run:
 
 
 def all_runs(sweep: Sweep) -> list[Run]:
-    """Seeds outermost, so that an early stop leaves whole comparisons."""
+    """All runs, ordered by seed: a sweep that stops early has complete comparisons."""
     names = [variant.name for variant in sweep.variants]
     product = itertools.product(sweep.seeds, names, sweep.tasks)
     return [Run(task, name, seed) for seed, name, task in product]
 
 
 def folder(sweep: Sweep, run: Run) -> pathlib.Path:
-    """Where the run writes."""
+    """The folder of a run."""
     name = f"{run.task}-{run.variant}-seed{run.seed}"
     return sweep.folder / re.sub(r"[^\w.]+", "-", name)
 
 
 def log(sweep: Sweep, run: Run) -> pathlib.Path:
-    """Where what it prints goes."""
+    """The file that takes the output of a run."""
     path = folder(sweep, run)
     return path.with_name(path.name + ".log")
 
 
 def flags(sweep: Sweep, run: Run) -> tuple[str, ...]:
-    """What its program is told of the run, but for the folder."""
+    """The flags of a run, without its folder."""
     own = next(variant.flags for variant in sweep.variants if variant.name == run.variant)
     length = () if sweep.env_steps is None else ("--env-steps", str(sweep.env_steps))
     return ("--task", run.task, "--seed", str(run.seed), *sweep.flags, *own, *length)
 
 
 def command(sweep: Sweep, run: Run) -> list[str]:
-    """What begins the run, or goes on with it where it was begun."""
+    """The command that starts the run, or resumes it."""
     path = folder(sweep, run)
     again = [] if run_folder.read_config(path) is None else ["--resume"]
     words = [*flags(sweep, run), "--logdir", str(path), *again]
@@ -91,13 +91,13 @@ def command(sweep: Sweep, run: Run) -> list[str]:
 
 
 def finished(sweep: Sweep, run: Run) -> bool:
-    """Whether the newest checkpoint is at the end already."""
+    """Whether the newest checkpoint is at the end of the run."""
     newest, length = checkpoint.latest(folder(sweep, run)), env_steps(sweep, run)
     return newest is not None and length is not None and int(newest.name) >= length
 
 
 def env_steps(sweep: Sweep, run: Run) -> int | None:
-    """How long the run is to be; None where only its preset knows, and it was not begun."""
+    """Length of the run; None if it is that of the preset and the run was not started."""
     if sweep.env_steps is not None:
         return sweep.env_steps
     config = run_folder.read_config(folder(sweep, run))
@@ -105,7 +105,7 @@ def env_steps(sweep: Sweep, run: Run) -> int | None:
 
 
 def unfinished_jobs(sweep: Sweep) -> list[Job]:
-    """What is left to do."""
+    """A job for each run that is not finished."""
     return [
         Job(str(run), command(sweep, run), log(sweep, run))
         for run in all_runs(sweep)
@@ -114,7 +114,7 @@ def unfinished_jobs(sweep: Sweep) -> list[Job]:
 
 
 def check(sweep: Sweep, suite: str) -> None:
-    """Refuses what would only fail in every run, or after hours of them.
+    """Refuses what would fail in every run, or only after hours.
 
     Raises:
       InvalidInput: names the option, its value and the remedy.
@@ -130,49 +130,49 @@ def check(sweep: Sweep, suite: str) -> None:
         for run in all_runs(sweep):
             if run.variant == variant.name:
                 own = dataclasses.replace(config, task=run.task, seed=run.seed)
-                check_begun(folder(sweep, run), own)
+                check_started(folder(sweep, run), own)
 
 
-def check_begun(path: pathlib.Path, config: Config) -> None:
-    """Refuses a run that was begun with other settings than it would begin with now.
+def check_started(path: pathlib.Path, config: Config) -> None:
+    """Refuses a run that was started with other settings than `config`.
 
-    It keeps its own when it is resumed, so a table would mix them. That happens when a sweep
-    of a small preset is made longer: the warm-up of value alignment follows the length of a
-    run, and those that were begun before have a shorter one than those that were not.
+    A resumed run keeps its settings, so one table would mix two of them. This happens when a
+    sweep of a small preset is made longer: the warm-up of value alignment is a share of the
+    length, so runs that were started before have a shorter warm-up than new ones.
 
     Raises:
       InvalidInput: names the first setting that differs.
     """
-    begun = run_folder.read_config(path)
-    if begun is None:
+    started = run_folder.read_config(path)
+    if started is None:
         return
-    saved = dict(validate.values(begun))
+    saved = dict(validate.values(started))
     for name, value in validate.values(config):
         if name not in resume.MAY_DIFFER and value != saved.get(name):
-            remedy = f"{path} was begun with {saved.get(name)!r}; use another --runs"
-            if begun.env_steps != config.env_steps:
-                remedy += f", or its --env-steps {begun.env_steps}"
+            remedy = f"{path} was started with {saved.get(name)!r}; use another --runs"
+            if started.env_steps != config.env_steps:
+                remedy += f", or its --env-steps {started.env_steps}"
             raise InvalidInput(name, value, remedy)
 
 
 def parsed(sweep: Sweep, run: Run, suite: str) -> Config:
-    """The config that the flags of the run amount to."""
+    """The config that the flags of a run give."""
     return command_line.parse(flags(sweep, run), suite=suite, description="").config
 
 
 def check_distinct(name: str, values: Collection) -> None:
-    """Refuses an option of which there is none, or something twice."""
+    """Refuses an empty option, and one that names something twice."""
     if not values or len(set(values)) < len(values):
-        raise InvalidInput(name, values, "use at least one, and each once")
+        raise InvalidInput(name, values, "use at least one, and each only once")
 
 
 def check_places(*, jobs: int, runs: pathlib.Path | None, results: pathlib.Path) -> None:
-    """Refuses folders that cannot be written to, and figures that cannot be drawn.
+    """Refuses folders that are not writable, and a missing matplotlib.
 
     Args:
-      jobs: runs side by side.
-      runs: None where none will be started.
-      results: where tables and figures go.
+      jobs: number of runs at the same time.
+      runs: folder of the runs; None if none will be started.
+      results: folder of tables and figures.
 
     Raises:
       InvalidInput: names the option, its value and the remedy.
