@@ -378,7 +378,7 @@ class Config:
     """One run. `env_steps` counts control steps, action repeat included."""
 
     suite: str = "dmc_proprio"
-    """of the task, such as dmc_vision; `vawm.runs.suites` has them all"""
+    """suite of the task, such as dmc_vision; see `vawm.runs.suites`"""
     task: str = "cartpole_swingup"
     """name of the environment in its suite"""
     agent: AgentName = "dreamerv3"
