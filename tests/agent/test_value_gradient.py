@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import tiny
 import tiny_vagram
+from learners import learner
 from nets_twin import noisy
 from toy_batch import batch, norm
 
@@ -148,7 +149,8 @@ def gradient(**changes):
     params = noisy(params)
 
     def total(params, slow):
-        return loss(params, state, slow, batch(agent), jax.random.key(1), jnp.asarray(1))
+        given = learner(params, model_state=state, slow_critic=slow)
+        return loss(params, given, batch(agent), jax.random.key(1), jnp.asarray(1))
 
     run = jax.jit(jax.grad(total, has_aux=True, argnums=(0, 1)))
     (own, slow), (_, _, metrics) = run(params, params.critic)
