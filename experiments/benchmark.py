@@ -44,7 +44,8 @@ from vawm.errors import InvalidInput
 from vawm.learning import from_replay, train
 from vawm.learning.collector import make_collect
 from vawm.learning.from_replay import Draw
-from vawm.learning.update import init_learner, make_update
+from vawm.learning.state import init_learner
+from vawm.learning.update import make_update
 from vawm.process import huge_pages
 from vawm.runs import budget, validate
 from vawm.runs.suites import dmc_vision

@@ -26,7 +26,7 @@ from vawm.agent import Agent, make_agent
 from vawm.cli import command_line, flags
 from vawm.config import Config, ValueAlignmentConfig
 from vawm.envs.protocol import check_positive
-from vawm.learning.objective import make_value_alignment
+from vawm.learning.alignment import make_value_alignment
 from vawm.losses import transforms
 from vawm.process import cache
 from vawm.sweep.results import line

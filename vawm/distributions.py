@@ -1,4 +1,4 @@
-"""Distributions of latents and policies. The only module that imports distrax."""
+"""Distributions of latents and of actions. The only module that imports distrax."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ with warnings.catch_warnings():
     import distrax
 
 __all__ = [
-    "Policy",
+    "ActionDistribution",
     "bounded_normal",
     "on_simplex",
     "one_hot_categorical",
@@ -32,15 +32,15 @@ Key = jax.Array
 
 
 def sample_index(logits: Array, uniform: Array, *, unimix: float) -> Array:
-    """Draw a class by inverting the distribution function at `uniform`.
+    """Draw a class by inverting the cumulative distribution at `uniform`.
 
-    One uniform per categorical costs K times less randomness than Gumbel noise, and the same
-    uniforms under equal logits give equal samples.
+    This needs one random number per categorical, where Gumbel noise needs K. Equal logits with
+    the same random numbers give equal samples.
 
     Args:
       logits: `[..., K]`, before unimix.
       uniform: `[...]` in [0, 1).
-      unimix: uniform share mixed into softmax(logits).
+      unimix: share of the uniform distribution mixed into softmax(logits).
 
     Returns:
       `[...]` int32 in [0, K).
@@ -49,13 +49,13 @@ def sample_index(logits: Array, uniform: Array, *, unimix: float) -> Array:
 
 
 def on_simplex(stoch: Array) -> Array:
-    """The same z, for what sums to 1 in each categorical; gradients by it are centred there.
+    """The same z, but with gradients that have mean 0 over the classes of each categorical.
 
-    What depends on z alone has a gradient that is open up to a number for all classes of a
-    categorical, as nothing moves z off the simplex. Through here that number is 0.
+    A gradient with respect to z is defined only up to a constant per categorical, because the
+    entries of a categorical always sum to 1. This function sets that constant to 0.
 
     Args:
-      stoch: `[..., S, K]`.
+      stoch: `[..., S, K]`, summing to 1 over K.
     """
     return stoch - stoch.mean(-1, keepdims=True) + 1 / stoch.shape[-1]
 
@@ -68,14 +68,14 @@ def sample_one_hot(logits: Array, uniform: Array, *, unimix: float) -> Array:
     Args:
       logits: `[..., K]`, before unimix.
       uniform: `[...]` in [0, 1); see `sample_index`.
-      unimix: uniform share mixed into softmax(logits).
+      unimix: share of the uniform distribution mixed into softmax(logits).
 
     Returns:
-      `[..., K]` float32, exactly 0 and 1. The gradient to the logits is that of p.
+      `[..., K]` float32, exactly 0 and 1. The logits receive the gradient of p.
     """
     probs = probabilities(logits, unimix=unimix)
     one_hot = jax.nn.one_hot(_invert(probs, uniform), logits.shape[-1])
-    # p - sg(p) is exactly 0: added first, it leaves no rounding in the sample.
+    # p - sg(p) is exactly 0. Computed first, it adds no rounding error to the sample.
     return one_hot + (probs - jax.lax.stop_gradient(probs))
 
 
@@ -85,8 +85,8 @@ def probabilities(logits: Array, *, unimix: float) -> Array:
     return (1 - unimix) * probs + unimix / logits.shape[-1]
 
 
-class Policy(NamedTuple):
-    """Pure functions of an action distribution, for any leading dims."""
+class ActionDistribution(NamedTuple):
+    """A distribution of actions as pure functions, for any leading dims."""
 
     sample: Callable[[Key], Array]  # [..., A]
     log_prob: Callable[[Array], Array]  # [..., A] -> [...]
@@ -94,11 +94,13 @@ class Policy(NamedTuple):
     mode: Callable[[], Array]  # [..., A]
 
 
-def bounded_normal(mean: Array, std_logit: Array, *, min_std: float, max_std: float) -> Policy:
+def bounded_normal(
+    mean: Array, std_logit: Array, *, min_std: float, max_std: float
+) -> ActionDistribution:
     """Normal(tanh(mean), std), std = (max - min) * sigmoid(std_logit + 2) + min.
 
-    Samples are neither squashed nor clipped, and log-probabilities are of the raw sample: the
-    environment clips what it receives. Log-probability and entropy are sums over actions.
+    Samples are neither squashed nor clipped: log-probabilities are of the raw sample, and the
+    environment clips the action. Log-probability and entropy are summed over the A entries.
 
     Args:
       mean: `[..., A]` before tanh.
@@ -110,7 +112,7 @@ def bounded_normal(mean: Array, std_logit: Array, *, min_std: float, max_std: fl
     mean, std_logit = mean.astype(jnp.float32), std_logit.astype(jnp.float32)
     std = (max_std - min_std) * jax.nn.sigmoid(std_logit + 2.0) + min_std
     normal = distrax.Normal(jnp.tanh(mean), std)
-    return Policy(
+    return ActionDistribution(
         sample=lambda key: normal.sample(seed=key),
         log_prob=lambda action: normal.log_prob(action).sum(-1),
         entropy=lambda: normal.entropy().sum(-1),
@@ -118,12 +120,12 @@ def bounded_normal(mean: Array, std_logit: Array, *, min_std: float, max_std: fl
     )
 
 
-def one_hot_categorical(logits: Array, *, unimix: float) -> Policy:
-    """Categorical over one-hot actions `[..., A]`, with a uniform share mixed in."""
+def one_hot_categorical(logits: Array, *, unimix: float) -> ActionDistribution:
+    """Categorical over one-hot actions `[..., A]`, mixed with the uniform distribution."""
     categorical = distrax.OneHotCategorical(
         logits=unimix_logits(logits, unimix), dtype=jnp.float32
     )
-    return Policy(
+    return ActionDistribution(
         sample=lambda key: categorical.sample(seed=key),
         log_prob=categorical.log_prob,
         entropy=categorical.entropy,
@@ -132,8 +134,8 @@ def one_hot_categorical(logits: Array, *, unimix: float) -> Policy:
 
 
 def _invert(probs: Array, uniform: Array) -> Array:
-    """The first class whose cumulated probability exceeds `uniform`."""
+    """The first class whose cumulative probability exceeds `uniform`."""
     chex.assert_equal_shape([probs[..., 0], uniform])
-    # Without the last sum, which may round to less than 1, the index cannot reach K.
+    # The last sum may round to less than 1. Without it the index cannot reach K.
     passed = jnp.cumsum(probs, axis=-1)[..., :-1] <= uniform[..., None]
     return passed.sum(-1, dtype=jnp.int32)

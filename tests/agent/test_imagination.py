@@ -10,7 +10,7 @@ import tiny
 
 from vawm.agent import make_agent
 from vawm.agent.imagination import imagine
-from vawm.distributions import Policy
+from vawm.distributions import ActionDistribution
 from vawm.types import Latent
 from vawm.world_model.protocol import WorldModel
 
@@ -28,7 +28,9 @@ def counting_model():
 
 def doubling_policy(latent):
     """a = 2 h, deterministic."""
-    return Policy(sample=lambda key: 2 * latent.deter, log_prob=None, entropy=None, mode=None)
+    return ActionDistribution(
+        sample=lambda key: 2 * latent.deter, log_prob=None, entropy=None, mode=None
+    )
 
 
 def test_each_latent_follows_from_the_action_before_it():

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import tiny
 import tiny_vagram
+from learners import learner
 from nets_twin import noisy
 from toy_batch import batch, norm
 
@@ -26,16 +27,14 @@ AGENT = make_agent(CONFIG, SPEC)
 
 # V = p * (sum_j w_j z_j)^2 * mean(h): two numbers are enough to compute its gradient by hand.
 WEIGHT = np.linspace(-1.0, 2.0, 16)
-SIMPLE = AGENT._replace(
-    critic=Critic(
-        init=lambda key: jnp.float32(1),
-        logits=lambda p, latent: (
-            p
-            * jnp.square(latent.stoch.reshape(*latent.stoch.shape[:-2], 16) @ WEIGHT)
-            * latent.deter.mean(-1)
-        )[..., None],
-        code=TwoHot(jnp.zeros(1), lambda y: y, lambda logits: logits[..., 0]),
-    )
+SIMPLE = Critic(
+    init=lambda key: jnp.float32(1),
+    logits=lambda p, latent: (
+        p
+        * jnp.square(latent.stoch.reshape(*latent.stoch.shape[:-2], 16) @ WEIGHT)
+        * latent.deter.mean(-1)
+    )[..., None],
+    code=TwoHot(jnp.zeros(1), lambda y: y, lambda logits: logits[..., 0]),
 )
 
 
@@ -131,12 +130,10 @@ def test_the_joint_form_equals_its_derivatives_by_hand():
 @pytest.mark.parametrize("form", ["diagonal", "joint"])
 def test_a_critic_that_ignores_z_has_no_loss(form):
     """Weights that are equal over the classes of a categorical say nothing of its class."""
-    ignoring = AGENT._replace(
-        critic=SIMPLE.critic._replace(
-            logits=lambda p, latent: (
-                p * latent.stoch.sum(-1) @ jnp.arange(1.0, 5.0) * latent.deter.mean(-1)
-            )[..., None]
-        )
+    ignoring = SIMPLE._replace(
+        logits=lambda p, latent: (
+            p * latent.stoch.sum(-1) @ jnp.arange(1.0, 5.0) * latent.deter.mean(-1)
+        )[..., None]
     )
     loss = make_value_gradient_loss(ignoring.critic, model(value_gradient_form=form))
     np.testing.assert_allclose(loss(jnp.float32(2), jnp.float32(3), inference()), 0, atol=1e-9)
@@ -152,7 +149,8 @@ def gradient(**changes):
     params = noisy(params)
 
     def total(params, slow):
-        return loss(params, state, slow, batch(agent), jax.random.key(1), jnp.asarray(1))
+        given = learner(params, model_state=state, slow_critic=slow)
+        return loss(params, given, batch(agent), jax.random.key(1), jnp.asarray(1))
 
     run = jax.jit(jax.grad(total, has_aux=True, argnums=(0, 1)))
     (own, slow), (_, _, metrics) = run(params, params.critic)

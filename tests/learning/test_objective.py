@@ -8,12 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import tiny
+from learners import learner
 from nets_twin import noisy
 from toy_batch import BATCH, LENGTH, batch, norm
 
 from vawm.agent import make_agent
 from vawm.config import ValueAlignmentConfig
 from vawm.learning import objective
+from vawm.learning.alignment import make_value_alignment
 from vawm.types import Inference, Latent
 
 SPEC = tiny.env().spec
@@ -36,7 +38,7 @@ def make(alignment=ON, **critic):
 def alignment_gradient(alignment):
     """A compiled function of parameters: L_var, and the gradient of its mean alone."""
     agent, config = make(alignment)
-    value_alignment = objective.make_value_alignment(agent, config)
+    value_alignment = make_value_alignment(agent, config)
 
     def loss(params):
         explanation, _ = agent.world_model.explain(
@@ -118,7 +120,7 @@ def test_the_weight_is_gated_by_the_warmup_and_follows_its_mode(alignment, step,
     latents = [Latent(deter, jax.nn.one_hot(index + k, 4)) for k in (0, 1)]
     logits = jnp.zeros((*shape, 4, 4))
     inference = Inference(*latents, logits, logits)
-    value_alignment = jax.jit(objective.make_value_alignment(agent, config))
+    value_alignment = jax.jit(make_value_alignment(agent, config))
     aligned, weight, _ = value_alignment(
         params().critic, inference, jnp.full(shape, 3.0), jnp.asarray(step)
     )
@@ -136,14 +138,11 @@ def full_gradients(alignment, **critic):
     def losses(params, slow):
         data = batch(agent)
         keys = jax.random.split(jax.random.key(1))
-        first, (inference, state, metrics) = model_loss(
-            params, model_state(), slow, data, keys[0], jnp.asarray(1)
-        )
-        scale = objective.returns.init_return_scale()
-        second, (_, more) = behaviour_loss(
-            params, state, slow, scale, data, inference, (), keys[1]
-        )
-        return jnp.stack([first, second]), metrics | more
+        given = learner(params, model_state=model_state(), slow_critic=slow)
+        first, explained = model_loss(params, given, data, keys[0], jnp.asarray(1))
+        given = given._replace(model_state=explained.model_state)
+        second, behaved = behaviour_loss(params, given, data, explained.inference, (), keys[1])
+        return jnp.stack([first, second]), explained.metrics | behaved.metrics
 
     slow = jax.tree.map(lambda x: x + 0.01, params().critic)
     jacobian, metrics = jax.jit(jax.jacrev(losses, has_aux=True))(params(), slow)
@@ -177,7 +176,8 @@ def products(alignment):
 
     def loss(params):
         data, key = batch(agent), jax.random.key(1)
-        return model_loss(params, model_state(), params.critic, data, key, jnp.asarray(1))[0]
+        given = learner(params, model_state=model_state())
+        return model_loss(params, given, data, key, jnp.asarray(1))[0]
 
     hlo = jax.jit(jax.grad(loss)).lower(params()).compile().as_text()
     return hlo.count(" dot(") + hlo.count("dot_general")
@@ -199,11 +199,11 @@ def test_shared_noise_gives_no_loss_where_prior_equals_posterior():
         out = jax.tree.map(jnp.zeros_like, heads["prior_net"]["heads_0"])
         rssm["prior_net"] = heads["prior_net"] | {"heads_0": out}
         params = params._replace(world_model=params.world_model | {"rssm": rssm})
-        key = jax.random.key(1)
-        _, (_, _, metrics) = objective.make_world_model_loss(agent, config)(
-            params, model_state(), params.critic, batch(agent), key, jnp.asarray(1)
+        given, key = learner(params, model_state=model_state()), jax.random.key(1)
+        _, explained = objective.make_world_model_loss(agent, config)(
+            params, given, batch(agent), key, jnp.asarray(1)
         )
-        return metrics["value_alignment/loss"]
+        return explained.metrics["value_alignment/loss"]
 
     assert aligned(params()) == 0.0
 
@@ -215,10 +215,10 @@ def test_what_is_logged_does_not_depend_on_scales_or_weight():
     lines = []
     for alignment in (ON, scaled, off):
         agent, config = make(alignment)
-        loss = objective.make_world_model_loss(agent, config)
-        args = params(), model_state(), params().critic, batch(agent)
-        _, (_, _, metrics) = jax.jit(loss)(*args, jax.random.key(1), jnp.asarray(1))
-        lines.append(metrics)
+        loss = jax.jit(objective.make_world_model_loss(agent, config))
+        given, key = learner(params(), model_state=model_state()), jax.random.key(1)
+        _, explained = loss(params(), given, batch(agent), key, jnp.asarray(1))
+        lines.append(explained.metrics)
     first = lines[0]
     ratio = first["value_alignment/loss"] / first["value_alignment/kl"]
     np.testing.assert_allclose(ratio, ON.dynamics_scale + ON.representation_scale, rtol=1e-5)

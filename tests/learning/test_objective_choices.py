@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scalar_agent
+from learners import learner
 from objective_twin import (
     ACTOR,
     CRITIC,
@@ -151,8 +152,8 @@ def test_behaviour_equals_loops_over_imagined_paths(names):
     inference = scalar_agent.inference(jnp.asarray(h), jnp.asarray(z))
     scale = returns.ReturnScale(jnp.float32(-2.0), jnp.float32(4.0))
     given = contexts()[2] if "contexts" in names else ()
-    slow_critic, key = jnp.float32(SLOW), jax.random.key(0)
-    _, (_, metrics) = loss(PARAMS, (), slow_critic, scale, batch(), inference, given, key)
+    start = learner(PARAMS, slow_critic=jnp.float32(SLOW), return_scale=scale)
+    _, (_, metrics) = loss(PARAMS, start, batch(), inference, given, jax.random.key(0))
     expected = slow_behaviour(names, h, z, scale=(-2.0, 4.0))
     assert "loss/replay_critic" not in metrics
     for name, number in expected.items():
@@ -170,8 +171,8 @@ def test_a_symlog_critic_learns_symlogs_and_decodes_their_mean():
     loss = jax.jit(objective.make_behaviour_loss(agent, config))
     h, z = np.random.default_rng(1).normal(size=(B, T)), np.zeros((B, T))
     inference = scalar_agent.inference(jnp.asarray(h), jnp.asarray(z))
-    scale, key = returns.init_return_scale(), jax.random.key(0)
-    _, (_, metrics) = loss(PARAMS, (), jnp.float32(SLOW), scale, batch(), inference, (), key)
+    start = learner(PARAMS, slow_critic=jnp.float32(SLOW))
+    _, (_, metrics) = loss(PARAMS, start, batch(), inference, (), jax.random.key(0))
     bins = np.asarray(scalar_agent.BINS, np.float64)
 
     def decoded(center):

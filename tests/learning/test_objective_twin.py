@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scalar_agent
+from learners import learner
 from objective_twin import (
     DISCOUNT,
     REWARD,
@@ -23,7 +24,8 @@ from scalar_agent import AGENT, CONFIG, PARAMS
 
 from vawm.config import ValueAlignmentConfig
 from vawm.learning import objective
-from vawm.learning.update import init_learner, make_update
+from vawm.learning.state import init_learner
+from vawm.learning.update import make_update
 from vawm.losses import returns
 
 # Behaviour. A state is a pair (h, z).
@@ -35,8 +37,9 @@ behaviour_loss = jax.jit(objective.make_behaviour_loss(AGENT, CONFIG))
 def behaviour(h, z, scale=(-2.0, 4.0)):
     inference = scalar_agent.inference(jnp.asarray(h), jnp.asarray(z))
     scale = returns.ReturnScale(*map(jnp.float32, scale))
+    start = learner(PARAMS, slow_critic=jnp.float32(SLOW), return_scale=scale)
     _, (scale, metrics) = behaviour_loss(
-        PARAMS, (), jnp.float32(SLOW), scale, batch(), inference, (), jax.random.key(0)
+        PARAMS, start, batch(), inference, (), jax.random.key(0)
     )
     return scale, metrics
 
@@ -72,7 +75,11 @@ def compiled_model_loss(critic="online"):
 
 def model_loss(critic="online", params=PARAMS):
     _, (inference, _, metrics) = compiled_model_loss(critic)(
-        params, (), jnp.float32(SLOW), batch(), jax.random.key(0), jnp.asarray(1)
+        params,
+        learner(params, slow_critic=jnp.float32(SLOW)),
+        batch(),
+        jax.random.key(0),
+        jnp.asarray(1),
     )
     return inference, metrics
 
@@ -124,10 +131,10 @@ def compiled_update():
 
 @pytest.mark.parametrize(("updates", "env_steps", "opens"), [(24, 10**6, False), (25, 0, True)])
 def test_counted_in_updates_the_warmup_ignores_env_steps(updates, env_steps, opens):
-    learner = init_learner(AGENT, CONFIG, jax.random.key(0))
-    learner = learner._replace(step=jnp.asarray(updates))
+    start = init_learner(AGENT, CONFIG, jax.random.key(0))
+    start = start._replace(step=jnp.asarray(updates))
     _, _, metrics = compiled_update()(
-        learner, batch(), (), jax.random.key(0), jnp.asarray(env_steps)
+        start, batch(), (), jax.random.key(0), jnp.asarray(env_steps)
     )
     assert (metrics["value_alignment/weight"] > 0) == opens
     assert (metrics["loss/value_alignment"] > 0) == opens

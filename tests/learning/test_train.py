@@ -14,7 +14,7 @@ from vawm import envs
 from vawm.agent import make_agent
 from vawm.learning import replay, train
 from vawm.learning.from_replay import make_learn
-from vawm.learning.update import init_learner
+from vawm.learning.state import init_learner
 from vawm.types import Trajectory
 from vawm.world_model.packing import pack
 

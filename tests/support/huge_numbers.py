@@ -10,7 +10,8 @@ from nets_twin import noisy
 
 from vawm.agent import make_agent
 from vawm.learning import from_replay
-from vawm.learning.update import init_learner, make_update
+from vawm.learning.state import init_learner
+from vawm.learning.update import make_update
 from vawm.types import Batch, TimeStep, Trajectory
 
 AGENTS = (tiny.CONFIG, tiny_storm.CONFIG, tiny_vagram.CONFIG)

@@ -17,7 +17,7 @@ import tiny
 
 from vawm.agent import Agent
 from vawm.agent.actor_critic import Actor, Critic
-from vawm.distributions import Policy
+from vawm.distributions import ActionDistribution
 from vawm.losses import transforms
 from vawm.types import (
     EnvSpec,
@@ -117,7 +117,7 @@ def predict(params, state, latent):
 
 def policy(params, latent):
     h, _ = numbers(latent)
-    return Policy(
+    return ActionDistribution(
         sample=lambda key: (1 - h / 2)[..., None],
         log_prob=lambda action: -jnp.square(action[..., 0] - params * h),
         entropy=lambda: params * jnp.square(h),

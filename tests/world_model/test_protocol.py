@@ -15,7 +15,7 @@ from nets_twin import noisy
 
 from vawm.agent import make_agent
 from vawm.config import ValueAlignmentConfig
-from vawm.learning import objective
+from vawm.learning.alignment import make_value_alignment
 from vawm.types import Batch, EnvSpec, Trajectory, image, vector
 
 BATCH, LENGTH = 3, 6
@@ -346,7 +346,7 @@ def test_value_alignment_trains_the_latent_dynamics_of_storm_and_nothing_else():
     agent, (params, state) = agent_of(name), variables(name)
     config, _ = MODELS[name]
     alignment = ValueAlignmentConfig(weight="static", static_weight=1.0, warmup_steps=0)
-    aligned = objective.make_value_alignment(
+    aligned = make_value_alignment(
         agent, dataclasses.replace(config, value_alignment=alignment)
     )
 

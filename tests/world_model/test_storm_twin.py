@@ -13,7 +13,8 @@ from nets_twin import float64
 from vawm.agent import make_agent
 from vawm.config import ValueAlignmentConfig
 from vawm.learning.objective import make_behaviour_loss, make_world_model_loss
-from vawm.learning.update import init_learner, make_update
+from vawm.learning.state import init_learner
+from vawm.learning.update import make_update
 from vawm.types import Batch, EnvSpec, Trajectory, image
 
 SPEC = EnvSpec("test", image(48), 3, True, 1, 1, None)
@@ -81,15 +82,10 @@ def ours():
     arguments = state.params.world_model, state.model_state
     explain = jax.jit(AGENT.world_model.explain)
     explanation, statistics = explain(*arguments, key_model(), as_batch(DATA))
-    _, (_, _, metrics) = model_loss()(
-        state.params,
-        state.model_state,
-        state.slow_critic,
-        as_batch(DATA),
-        key_model(),
-        jnp.asarray(1),
+    _, explained = model_loss()(
+        state.params, state, as_batch(DATA), key_model(), jnp.asarray(1)
     )
-    return explanation, statistics, metrics
+    return explanation, statistics, explained.metrics
 
 
 def one_hots():
@@ -161,8 +157,7 @@ def gradient():
     def loss(world_model):
         return model_loss()(
             state.params._replace(world_model=world_model),
-            state.model_state,
-            state.slow_critic,
+            state,
             as_batch(DATA),
             key_model(),
             jnp.asarray(1),
@@ -246,9 +241,7 @@ def test_actor_and_critic_learn_in_what_the_world_model_has_become():
     def critic_loss(world_model, model_state):
         _, (_, measured) = behaviour_loss(
             state.params._replace(world_model=world_model),
-            model_state,
-            state.slow_critic,
-            state.return_scale,
+            state._replace(model_state=model_state),
             as_batch(DATA),
             (),
             contexts(),

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from vawm import distributions, nets
 from vawm.config import ActorConfig, CriticConfig
-from vawm.distributions import Policy
+from vawm.distributions import ActionDistribution
 from vawm.errors import InvalidInput
 from vawm.losses import transforms
 from vawm.losses.transforms import TwoHot
@@ -18,11 +18,17 @@ from vawm.types import Array, EnvSpec, Key, Latent, PyTree, flat_stoch
 
 
 class Actor(NamedTuple):
-    """Pure functions of a stochastic policy pi(a | s), Eq. 6."""
+    """Pure functions of a stochastic policy pi(a | s), Eq. 6.
+
+    Attributes:
+      init: `(key) -> params`.
+      policy: `(params, latent) -> ActionDistribution`, what the losses and imagination use.
+      behaviour: the same at `collect_temperature`, what acts while experience is collected.
+    """
 
     init: Callable[[Key], PyTree]
-    policy: Callable[[PyTree, Latent], Policy]
-    behaviour: Callable[[PyTree, Latent], Policy]  # what collects: `policy`, cooled or not
+    policy: Callable[[PyTree, Latent], ActionDistribution]
+    behaviour: Callable[[PyTree, Latent], ActionDistribution]
 
 
 class Critic(NamedTuple):
@@ -30,24 +36,24 @@ class Critic(NamedTuple):
 
     init: Callable[[Key], PyTree]
     logits: Callable[[PyTree, Latent], Array]  # [..., bins]
-    code: TwoHot  # what the logits say
+    code: TwoHot  # values as logits over bins, and back
 
 
 def features(latent: Latent) -> tuple[Array, Array]:
-    """[h, z] as the pair of inputs that networks read."""
+    """[h, z] as the two inputs of a network."""
     return latent.deter, flat_stoch(latent.stoch)
 
 
 def make_actor(
     config: ActorConfig, spec: EnvSpec, feature_size: int, dtype: jnp.dtype = jnp.float32
 ) -> Actor:
-    """A one-hot categorical or a bounded normal, by the kind of action in `spec`.
+    """A one-hot categorical for discrete actions, a bounded normal for continuous ones.
 
     Raises:
       InvalidInput: a temperature for continuous actions.
     """
     if not spec.discrete and config.collect_temperature != 1.0:
-        remedy = "use 1: only discrete policies have one"
+        remedy = "use 1: continuous actions have no temperature"
         raise InvalidInput("actor.collect_temperature", config.collect_temperature, remedy)
     heads = 1 if spec.discrete else 2
     outputs = (spec.action_size,) * heads
@@ -60,11 +66,13 @@ def make_actor(
         outputs = net.apply({"params": params}, *features(latent))
         return [jnp.asarray(x, jnp.float32) for x in outputs]
 
-    def discrete(params: PyTree, latent: Latent, temperature: float = 1.0) -> Policy:
+    def discrete(
+        params: PyTree, latent: Latent, temperature: float = 1.0
+    ) -> ActionDistribution:
         (logits,) = read(params, latent)
         return distributions.one_hot_categorical(logits / temperature, unimix=config.unimix)
 
-    def continuous(params: PyTree, latent: Latent) -> Policy:
+    def continuous(params: PyTree, latent: Latent) -> ActionDistribution:
         mean, std_logit = read(params, latent)
         return distributions.bounded_normal(
             mean, std_logit, min_std=config.min_std, max_std=config.max_std
@@ -79,7 +87,7 @@ def make_actor(
 def make_critic(
     config: CriticConfig, feature_size: int, dtype: jnp.dtype = jnp.float32
 ) -> Critic:
-    """Two-hot critic. DreamerV3's last layer starts at zero, so it starts by predicting 0."""
+    """A critic with two-hot values. DreamerV3's starts at 0: its last layer is zero."""
     net = make_network(config, feature_size, (config.bins,), scale=0.0, dtype=dtype)
 
     def init(key: Key) -> PyTree:
@@ -99,7 +107,7 @@ def make_network(
     scale: float,
     dtype: jnp.dtype,
 ) -> nets.MLP | nets.ReluMLP:
-    """The layers; `scale` is that of DreamerV3's initial outputs, STORM's are PyTorch's."""
+    """The layers. `scale` is for DreamerV3's initial output weights; STORM uses PyTorch's."""
     sizes = feature_size, config.layers, config.units, outputs
     if config.network == "storm":
         return nets.ReluMLP(*sizes, dtype=dtype)

@@ -7,14 +7,14 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from vawm.distributions import Policy
+from vawm.distributions import ActionDistribution
 from vawm.types import Imagined, Key, Latent, PyTree
 from vawm.world_model.protocol import WorldModel
 
 
 def imagine(
     world_model: WorldModel,
-    policy: Callable[[Latent], Policy],
+    policy: Callable[[Latent], ActionDistribution],
     params: PyTree,
     state: PyTree,
     key: Key,

@@ -1,4 +1,4 @@
-"""VaGraM on latents: what the prior predicts, judged by how much the value depends on it."""
+"""VaGraM on latents: errors of the prior, weighted by how much the value depends on them."""
 
 from __future__ import annotations
 
@@ -18,37 +18,38 @@ FORMS = {
     "second_order": losses.vagram_second_order_loss,
     "joint": losses.vagram_joint_loss,
 }
-"""Choice of `value_gradient_form` -> loss."""
+"""Each `value_gradient_form` and its loss."""
 
 
 def make_value_gradient_loss(
-    critic: Critic, model: VagramConfig
+    critic: Critic, config: VagramConfig
 ) -> Callable[[PyTree, PyTree, Inference], Array]:
     """Build `value_gradient_loss(critic_params, slow_critic_params, inference) -> [B, T]`.
 
         L = scale * sum_j (dV/dz_j)^2 (z~_j - sg z_j)^2,    dV/dz at (h_t, z_t)
 
     (Voelcker et al., 2022, on latents: our reading), or another form of `vawm.losses.vagram`.
-    Each categorical of z sums to 1, which leaves dV/dz open up to a number for all classes of
-    one; it is centred there, and the Hessian with it, so that a critic that ignores z has no
-    loss. z~ are the probabilities of the prior, z of the posterior, after unimix; V is the
-    critic's mean, or its symlog. Gradients reach the world model through z~: the prior, and
-    h_t by way of it. The critics' parameters are stopped, and so is everything that the value
-    is differentiated at.
+    z and z~ are the probabilities of the posterior and the prior, after unimix. V is the
+    critic's mean, or its symlog. Each categorical of z sums to 1, so dV/dz is defined only up
+    to a constant per categorical. We take the gradient, and the Hessian, with mean 0 over the
+    classes, so that a critic that ignores z gives no loss.
+
+    Gradients reach the world model through z~: the prior, and through the prior h_t. The
+    parameters of both critics are stopped, and so are h_t and z where V is differentiated.
     """
-    form = FORMS[model.value_gradient_form]
+    form = FORMS[config.value_gradient_form]
 
     def value_of(params: PyTree, deter: Array) -> Callable[[Array], Array]:
         def value(z: Array) -> Array:
-            stoch = z.reshape(*z.shape[:-1], model.stoch, model.classes)
+            stoch = z.reshape(*z.shape[:-1], config.stoch, config.classes)
             stoch = distributions.on_simplex(stoch).astype(deter.dtype)
             mean = critic.code.mean(critic.logits(params, Latent(deter, stoch)))
-            return transforms.symlog(mean) if model.value_gradient_unit == "symlog" else mean
+            return transforms.symlog(mean) if config.value_gradient_unit == "symlog" else mean
 
         return value
 
     def probabilities(logits: Array) -> Array:
-        return flat_stoch(distributions.probabilities(logits, unimix=model.unimix))
+        return flat_stoch(distributions.probabilities(logits, unimix=config.unimix))
 
     def value_gradient_loss(online: PyTree, slow: PyTree, inference: Inference) -> Array:
         target = probabilities(inference.post_logits)
@@ -57,10 +58,10 @@ def make_value_gradient_loss(
 
         def loss(params: PyTree) -> Array:
             value = value_of(jax.lax.stop_gradient(params), deter)
-            return model.value_gradient_scale * form(value, prediction, target)
+            return config.value_gradient_scale * form(value, prediction, target)
 
-        if model.value_gradient_critic == "both":
+        if config.value_gradient_critic == "both":
             return (loss(online) + loss(slow)) / 2
-        return loss(online if model.value_gradient_critic == "online" else slow)
+        return loss(online if config.value_gradient_critic == "online" else slow)
 
     return value_gradient_loss

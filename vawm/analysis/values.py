@@ -44,7 +44,7 @@ from vawm.agent import Agent, make_agent
 from vawm.analysis.episodes import Episodes, select
 from vawm.analysis.inference import check, make_infer, make_prior
 from vawm.config import Config
-from vawm.learning.objective import discount_of
+from vawm.learning.discount import discount_of
 from vawm.losses import transforms
 from vawm.policy import Policy
 from vawm.types import Array, Key, Latent, Params, PyTree

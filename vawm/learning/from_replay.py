@@ -13,7 +13,8 @@ from vawm.agent import Agent
 from vawm.config import Config
 from vawm.learning import image_store, replay
 from vawm.learning.replay import Positions, Replay
-from vawm.learning.update import Learner, make_update
+from vawm.learning.state import Learner
+from vawm.learning.update import make_update
 from vawm.types import Array, Key, Metrics, PyTree
 
 

@@ -27,8 +27,8 @@ from vawm.envs.protocol import HostEnvironment
 from vawm.learning import from_replay, image_store, replay
 from vawm.learning.collector import Collector, arrive, begin, depart
 from vawm.learning.replay import Replay
+from vawm.learning.state import Learner, init_learner
 from vawm.learning.train import TrainState, empty_replay
-from vawm.learning.update import Learner, init_learner
 from vawm.types import EnvSpec, Key, Metrics, Params, PyTree, TimeStep
 
 HostStep = Callable[[TrainState], tuple[TrainState, dict[str, Any]]]

@@ -1,19 +1,21 @@
-"""The one loss that an update differentiates, in the order in which the data flows.
+"""The two losses of an update, in the order in which the data flows.
 
-    1 explain the batch   2 maximum likelihood   3 value alignment      make_world_model_loss
-      (VaGraM in the place of the KL: make_value_gradient_loss)
-    4 imagine   5 returns and their scale                                       make_foresight
-    6 critic and actor                                                     make_behaviour_loss
+    1. Explain the batch with the world model
+    2. Maximum likelihood, Eq. 3                `vawm.learning.likelihood`
+    3. Value alignment, Eq. 4 and 5             `vawm.learning.alignment`
+                                                      make_world_model_loss
+    4. Imagine
+    5. Returns and their scale, Eq. 7 and 9     `vawm.learning.foresight`
+    6. Actor and critic, Eq. 7 and 8
+                                                      make_behaviour_loss
 
-Losses are pure functions of the same `Params`; `vawm.learning.update` differentiates them, as
-one sum or one after the other.
+Both are pure functions of the same `Params`. `vawm.learning.update` differentiates them: their
+sum, or one after the other.
 """
 
 from __future__ import annotations
 
-import functools
-import math
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import NamedTuple
 
 import jax
@@ -21,268 +23,84 @@ import jax.numpy as jnp
 
 from vawm import losses
 from vawm.agent import Agent
-from vawm.agent.imagination import imagine
 from vawm.config import Config
-from vawm.losses import returns, transforms
-from vawm.types import Array, Batch, Inference, Key, Latent, Metrics, Params, PyTree, Trajectory
+from vawm.learning.alignment import alignment_metrics, make_value_alignment, warmup_step
+from vawm.learning.discount import discount_of
+from vawm.learning.foresight import Foresight, imagination_metrics, make_foresight
+from vawm.learning.likelihood import latent_metrics, make_likelihood
+from vawm.learning.state import Learner
+from vawm.losses import returns
+from vawm.types import Array, Batch, Inference, Key, Latent, Metrics, Params, PyTree
 
 
-def total(parts: Metrics) -> Array:
-    """The sum of named scalars."""
-    return jnp.sum(jnp.stack(list(parts.values())))
+class Explained(NamedTuple):
+    """What the world model's loss leaves for the rest of an update."""
+
+    inference: Inference
+    model_state: PyTree  # after the batch
+    metrics: Metrics
 
 
-class Alignment(NamedTuple):
-    """L_var at every state of a batch that was predicted, `[B, T]`."""
+class Behaved(NamedTuple):
+    """What the loss of actor and critic leaves for the rest of an update."""
 
-    loss: Array  # Eq. 4, both terms with their scales
-    weight: Array  # Eq. 5
-    kl: Array  # KL[V(s) || V(s~)] in nats, whatever the scales; no gradient
+    return_scale: returns.ReturnScale  # after these returns
+    metrics: Metrics
 
 
-def make_value_alignment(agent: Agent, config: Config) -> Callable[..., Alignment]:
-    """Build `value_alignment(critic_params, inference, latent_kl, step) -> Alignment`.
+WorldModelLoss = Callable[[Params, Learner, Batch, Key, Array], tuple[Array, Explained]]
+BehaviourLoss = Callable[
+    [Params, Learner, Batch, Inference, PyTree, Key], tuple[Array, Behaved]
+]
 
-    The critic's parameters are stopped and the same for both latents; gradients reach the
-    world model through the latents, or only through z where `deter_gradient` is "stop".
+
+def make_world_model_loss(agent: Agent, config: Config) -> WorldModelLoss:
+    """Build `world_model_loss(params, learner, batch, key, env_steps) -> (loss, Explained)`.
+
+    Eq. 2: prediction, dynamics and value alignment of a batch. Gradients reach the world model
+    only. Of the learner it uses `model_state`, the slow critic and the number of updates.
     """
-    alignment = config.value_alignment
-    adaptive = functools.partial(
-        losses.value_alignment_weight, warmup_steps=alignment.warmup_steps
-    )
-
-    def weight_of(kl: Array, step: Array) -> Array:
-        if alignment.weight == "off":
-            return jnp.zeros_like(kl)
-        if alignment.weight == "static":  # where the KL is 0 only the warm-up is left of Eq. 5
-            return alignment.static_weight * adaptive(jnp.zeros_like(kl), step)
-        return adaptive(kl, step)
-
-    def value_alignment(
-        critic: PyTree, inference: Inference, kl: Array, step: Array
-    ) -> Alignment:
-        critic = jax.lax.stop_gradient(critic)
-        if alignment.weight == "off":  # no backward pass either
-            inference = jax.lax.stop_gradient(inference)
-        latent, prior_latent = inference.latent, inference.prior_latent
-        if alignment.deter_gradient == "stop":
-            deter = jax.lax.stop_gradient(latent.deter)
-            latent = latent._replace(deter=deter)
-            prior_latent = prior_latent._replace(deter=deter)
-        logits = agent.critic.logits(critic, latent)
-        prior_logits = agent.critic.logits(critic, prior_latent)
-        loss = losses.value_alignment_loss(
-            logits,
-            prior_logits,
-            dynamics_scale=alignment.dynamics_scale,
-            representation_scale=alignment.representation_scale,
-        )
-        value_kl = transforms.categorical_kl(*jax.lax.stop_gradient((logits, prior_logits)))
-        return Alignment(loss, weight_of(kl, step), value_kl)
-
-    return value_alignment
-
-
-def make_world_model_loss(agent: Agent, config: Config):
-    """Eq. 2: prediction, dynamics and value alignment of a batch.
-
-    Gradients reach the world model only. The state that the world model carries is returned as
-    the batch leaves it.
-    """
-    model = config.world_model
+    likelihood = make_likelihood(config)
     value_alignment = make_value_alignment(agent, config)
-    reward_code = transforms.make_two_hot(model.bins, model.bin_spacing)
-    discount = 1.0 if model.continue_target == "plain" else discount_of(config)
-    of_batch = model.free_nats_of == "batch"
-    dynamics_loss = losses.batch_dynamics_loss if of_batch else losses.dynamics_loss
+    slow = config.value_alignment.critic == "slow"
+    only_logged = {"value_alignment"} if config.value_alignment.weight == "off" else set()
 
-    def entropy(logits: Array) -> Array:
-        """Of z_t, in nats, summed over its categoricals."""
-        mixed = transforms.unimix_logits(logits, model.unimix)
-        return transforms.categorical_entropy(jax.lax.stop_gradient(mixed)).sum(-1)
-
-    def loss_fn(
-        params: Params, state: PyTree, slow_critic: PyTree, batch: Batch, key: Key, step: Array
-    ) -> tuple[Array, tuple[Inference, PyTree, Metrics]]:
+    def world_model_loss(
+        params: Params, learner: Learner, batch: Batch, key: Key, env_steps: Array
+    ) -> tuple[Array, Explained]:
         # 1. Explain the batch: what is it, and what could have been predicted?
-        explanation, state = agent.world_model.explain(params.world_model, state, key, batch)
-        inference, predictions, targets = explanation
+        explanation, model_state = agent.world_model.explain(
+            params.world_model, learner.model_state, key, batch
+        )
+        inference = explanation.inference
         # 2. Maximum likelihood, Eq. 3.
-        prediction = losses.prediction_loss(
-            predictions.obs,
-            predictions.reward,
-            predictions.cont,
-            targets.obs,
-            reward_code.encode(targets.reward),
-            targets.is_terminal,
-            bins=reward_code.bins,
-            discount=discount,
-        )
-        dynamics, kl = dynamics_loss(
-            inference.post_logits,
-            inference.prior_logits,
-            unimix=model.unimix,
-            free_nats=model.free_nats,
-            dynamics_scale=model.dynamics_scale,
-            representation_scale=model.representation_scale,
-        )
+        likely = likelihood(explanation)
         # 3. Value alignment, Eq. 4 and 5.
-        slow = config.value_alignment.critic == "slow"
-        critic = slow_critic if slow else params.critic
-        aligned = value_alignment(critic, inference, kl, step)
-        parts = {
-            "loss/reconstruction": model.reconstruction_scale * prediction.reconstruction,
-            "loss/reward": prediction.reward,
-            "loss/continue": prediction.cont,
-            "loss/dynamics": dynamics,
-        }
+        critic = learner.slow_critic if slow else params.critic
+        step = warmup_step(config, learner, env_steps)
+        aligned = value_alignment(critic, inference, likely.kl, step)
+
+        parts = likely.losses
         if agent.latent_loss is not None:
-            parts["loss/value_gradient"] = agent.latent_loss(
-                params.critic, slow_critic, inference
-            )
-        parts = {name: jnp.mean(part) for name, part in parts.items()}
-        loss_var = {"loss/value_alignment": jnp.mean(aligned.weight * aligned.loss)}
-        if config.value_alignment.weight != "off":
-            parts |= loss_var
-        metrics = parts | loss_var
-        metrics |= {
-            "value_alignment/loss": jnp.mean(aligned.loss),
-            "value_alignment/weight": jnp.mean(aligned.weight),
-            "value_alignment/kl": jnp.mean(aligned.kl),
-            "latent/kl": jnp.mean(kl),
-            "latent/posterior_entropy": jnp.mean(entropy(inference.post_logits)),
-            "latent/prior_entropy": jnp.mean(entropy(inference.prior_logits)),
-        }
-        return total(parts), (inference, state, metrics)
-
-    return loss_fn
-
-
-def discount_of(config: Config) -> float:
-    """gamma."""
-    return 1.0 - 1.0 / config.imagination.discount_horizon
-
-
-class Foresight(NamedTuple):
-    """H imagined steps from N states, `[H, N, ...]`, and what they promise."""
-
-    latent: Latent  # that the actions left from
-    action: Array  # [H, N, A]
-    value_logits: Array  # [H, N, bins] of the online critic, the only field with a gradient
-    returns: Array  # [H, N] lambda-returns, Eq. 7
-    slow_target: Array  # [H, N] the slow critic's value, or the lambda-returns of its values
-    advantage: Array  # [H, N] in units of the return scale, Eq. 8
-    weight: Array  # [H, N] probability, by the continue head, of getting there; or 1
-
-
-def read_discount(config: Config, logit: Array) -> Array:
-    """gamma * P(continue) of a continue logit; or gamma where that is likely, else 0."""
-    gamma, plain = discount_of(config), config.world_model.continue_target == "plain"
-    if config.imagination.continuation == "threshold":
-        # One half, or the logit of gamma / 2 where gamma is learned along.
-        limit = 0.0 if plain else math.log(gamma / (2.0 - gamma))
-        return gamma * (logit >= limit).astype(logit.dtype)
-    return gamma * jax.nn.sigmoid(logit) if plain else jax.nn.sigmoid(logit)
-
-
-def imagined_returns(config: Config, reward: Array, discount: Array, value: Array) -> Array:
-    """Lambda-returns `[H, N]` from what arrived with s_0..s_H and the values there."""
-    lambda_, arrived = config.imagination.lambda_, (reward[1:], discount[1:])
-    if config.imagination.value_index == "current":
-        return returns.lambda_returns(*arrived, value[:-1], value[-1], lambda_=lambda_)
-    return returns.lambda_returns(*arrived, value[1:], lambda_=lambda_)
-
-
-def make_foresight(agent: Agent, config: Config):
-    """Build `foresight(params, state, slow_critic, scale, inference, contexts, key)`.
-
-    It returns `(Foresight, scale, metrics)`. Imagined latents carry no gradient, neither do
-    the rewards, the continuation and the values read from them. Imagination begins where
-    `imagination.starts` says: at `inference`, or after the `contexts`, a `Batch`.
-    """
-    imagination, model = config.imagination, config.world_model
-    reward_code = transforms.make_two_hot(model.bins, model.bin_spacing)
-    actor, critic, world_model = agent.actor, agent.critic, agent.world_model
-    horizon = imagination.horizon
-    returns_of = functools.partial(imagined_returns, config)
-
-    def begin(params: PyTree, state: PyTree, inference: Inference, contexts: PyTree, key: Key):
-        if imagination.starts == "contexts":
-            return world_model.follow(params, state, key, contexts, horizon=horizon)[1]
-        assert world_model.starts is not None
-        return world_model.starts(params, state, inference)
-
-    def slow_target_of(params: PyTree, latent: Latent, reward: Array, discount: Array) -> Array:
-        if config.critic.slow_target == "returns":
-            value = critic.code.mean(critic.logits(params, latent))
-            return returns_of(reward, discount, value)
-        latent = jax.tree.map(lambda x: x[:-1], latent)
-        return critic.code.mean(critic.logits(params, latent))
-
-    def foresight(
-        params: Params,
-        state: PyTree,
-        slow_critic: PyTree,
-        scale_state: returns.ReturnScale,
-        inference: Inference,
-        contexts: PyTree,
-        key: Key,
-    ) -> tuple[Foresight, returns.ReturnScale, Metrics]:
-        frozen = jax.lax.stop_gradient(params)
-        key_starts, key_imagine = jax.random.split(key)
-        # 4. Imagine H steps from every start.
-        carry, start = begin(frozen.world_model, state, inference, contexts, key_starts)
-        imagined = imagine(
-            world_model,
-            lambda latent: actor.policy(frozen.actor, latent),
-            frozen.world_model,
-            state,
-            key_imagine,
-            carry,
-            start,
-            horizon=horizon,
+            value_gradient = agent.latent_loss(params.critic, learner.slow_critic, inference)
+            parts = parts | {"value_gradient": value_gradient}
+        parts = mean_of_each(parts | {"value_alignment": aligned.weight * aligned.loss})
+        metrics = alignment_metrics(aligned) | latent_metrics(
+            config.world_model, inference, likely.kl
         )
-        # 5. Lambda-returns and their scale, Eq. 7 and 9.
-        predictions = world_model.predict(frozen.world_model, state, imagined.latent)
-        reward = reward_code.mean(predictions.reward)
-        discount = read_discount(config, predictions.cont)
-        logits = critic.logits(params.critic, imagined.latent)
-        value = critic.code.mean(jax.lax.stop_gradient(logits))
-        target = returns_of(reward, discount, value)
-        scale_state = returns.update_return_scale(
-            scale_state,
-            target,
-            decay=imagination.return_scale_decay,
-            low=imagination.return_scale_low,
-            high=imagination.return_scale_high,
-        )
-        scale = returns.return_scale(scale_state, limit=imagination.return_scale_limit)
-        metrics = {
-            "imagination/reward": jnp.mean(reward[1:]),
-            "imagination/return": jnp.mean(target),
-            "imagination/value": jnp.mean(value),
-            "imagination/return_scale": scale,
-        }
-        reach = losses.discount_weights(discount)[:-1]
-        ahead = Foresight(
-            latent=jax.tree.map(lambda x: x[:-1], imagined.latent),
-            action=imagined.action,
-            value_logits=logits[:-1],
-            returns=target,
-            slow_target=slow_target_of(slow_critic, imagined.latent, reward, discount),
-            advantage=(target - value[:-1]) / scale,
-            weight=reach if imagination.reach_weights else jnp.ones_like(reach),
-        )
-        return ahead, scale_state, metrics
+        explained = Explained(inference, model_state, loss_metrics(parts) | metrics)
+        return total(parts, only_logged), explained
 
-    return foresight
+    return world_model_loss
 
 
-def make_behaviour_loss(agent: Agent, config: Config):
-    """Eq. 7 and 8: critic and actor from imagination, critic from replay.
+def make_behaviour_loss(agent: Agent, config: Config) -> BehaviourLoss:
+    """Build `behaviour_loss(params, learner, batch, inference, contexts, key)`.
 
-    Imagined latents carry no gradient; the replay value loss reaches the world model
-    unless `critic.replay_gradient` is off.
+    It returns `(loss, Behaved)`. Eq. 7 and 8: actor and critic from imagination, critic from
+    replay. Imagined latents carry no gradient; the critic's loss in replay reaches the world
+    model through `inference`, unless `critic.replay_gradient` is off. Of the learner it uses
+    `model_state`, the slow critic and the return scale.
     """
     actor_config, critic_config = config.actor, config.critic
     actor, critic = agent.actor, agent.critic
@@ -298,38 +116,36 @@ def make_behaviour_loss(agent: Agent, config: Config):
         )
 
     def replay_critic_loss(
-        params: Params, slow_critic: PyTree, steps: Trajectory, latent: Latent, bootstrap: Array
+        params: Params, learner: Learner, batch: Batch, latent: Latent, ahead: Foresight
     ) -> Array:
-        """Of the batch's own steps, `[B, T - 1]`, with imagined returns at the end."""
+        """`[B, T - 1]`: along the batch itself, imagined returns at its end."""
+        steps = jax.tree.map(lambda x: x[:, 1:], batch.trajectory)
         target = returns.replay_returns(
             steps.reward,
             steps.is_last,
             steps.is_terminal,
-            bootstrap,
+            ahead.returns[0].reshape(steps.reward.shape),
             discount=discount_of(config),
             lambda_=config.imagination.lambda_,
         )
         if not critic_config.replay_gradient:
             latent = jax.lax.stop_gradient(latent)
         logits = critic.logits(params.critic, latent)[:, :-1]
-        slow_logits = critic.logits(slow_critic, jax.lax.stop_gradient(latent))[:, :-1]
+        slow_logits = critic.logits(learner.slow_critic, jax.lax.stop_gradient(latent))[:, :-1]
         slow_value = critic.code.mean(slow_logits)
         return (1.0 - steps.is_last[:, :-1]) * critic_loss(logits, slow_value, target)
 
-    def loss_fn(
+    def behaviour_loss(
         params: Params,
-        state: PyTree,
-        slow_critic: PyTree,
-        scale_state: returns.ReturnScale,
+        learner: Learner,
         batch: Batch,
         inference: Inference,
         contexts: PyTree,
         key: Key,
-    ) -> tuple[Array, tuple[returns.ReturnScale, Metrics]]:
-        ahead, scale_state, metrics = foresight(
-            params, state, slow_critic, scale_state, inference, contexts, key
-        )
-        # 6. Critic and actor, Eq. 7 and 8; the critic also from replay.
+    ) -> tuple[Array, Behaved]:
+        # 4. and 5. Imagine, and judge what was imagined, Eq. 7 and 9.
+        ahead = foresight(params, learner, inference, contexts, key)
+        # 6. Actor and critic, Eq. 7 and 8; the critic also from replay.
         policy = actor.policy(params.actor, ahead.latent)
         log_prob, entropy = policy.log_prob(ahead.action), policy.entropy()
         actor_loss = losses.actor_loss(
@@ -337,18 +153,30 @@ def make_behaviour_loss(agent: Agent, config: Config):
         )
         imagined_loss = critic_loss(ahead.value_logits, ahead.slow_target, ahead.returns)
         parts = {
-            "loss/actor": actor_config.scale * ahead.weight * actor_loss,
-            "loss/critic": critic_config.scale * ahead.weight * imagined_loss,
+            "actor": actor_config.scale * ahead.weight * actor_loss,
+            "critic": critic_config.scale * ahead.weight * imagined_loss,
         }
-        if critic_config.replay_scale:
-            steps = jax.tree.map(lambda x: x[:, 1:], batch.trajectory)
-            bootstrap = ahead.returns[0].reshape(steps.reward.shape)
-            replayed_loss = replay_critic_loss(
-                params, slow_critic, steps, inference.latent, bootstrap
-            )
-            parts["loss/replay_critic"] = critic_config.replay_scale * replayed_loss
-        parts = {name: jnp.mean(part) for name, part in parts.items()}
-        metrics = parts | metrics | {"policy/entropy": jnp.mean(entropy)}
-        return total(parts), (scale_state, metrics)
+        if critic_config.replay_scale > 0:
+            replayed_loss = replay_critic_loss(params, learner, batch, inference.latent, ahead)
+            parts["replay_critic"] = critic_config.replay_scale * replayed_loss
 
-    return loss_fn
+        parts = mean_of_each(parts)
+        metrics = imagination_metrics(ahead) | {"policy/entropy": jnp.mean(entropy)}
+        return total(parts), Behaved(ahead.return_scale, loss_metrics(parts) | metrics)
+
+    return behaviour_loss
+
+
+def mean_of_each(parts: dict[str, Array]) -> dict[str, Array]:
+    """Losses of any shape -> their means, `[]`."""
+    return {name: jnp.mean(part) for name, part in parts.items()}
+
+
+def total(parts: dict[str, Array], only_logged: Collection[str] = ()) -> Array:
+    """The sum of named scalars, without those that are only logged."""
+    return jnp.sum(jnp.stack([x for name, x in parts.items() if name not in only_logged]))
+
+
+def loss_metrics(parts: dict[str, Array]) -> Metrics:
+    """Named losses as metrics."""
+    return {f"loss/{name}": part for name, part in parts.items()}

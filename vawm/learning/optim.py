@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import optax
 
-from vawm.config import AdamConfig, LaPropConfig
+from vawm.config import AdamConfig, LaPropConfig, OptimizerConfig
+from vawm.types import Params, PyTree
 
 
 def adaptive_gradient_clip(clip: float, floor: float) -> optax.GradientTransformation:
     """Scale each gradient tensor down to at most `clip * max(floor, ||parameter||)`.
 
-    Norms are over whole tensors, as in DreamerV3; `optax.adaptive_grad_clip` takes one per
-    output unit. `floor` lets tensors that start at zero move at all.
+    Norms are over whole tensors, as in DreamerV3; `optax.adaptive_grad_clip` has one norm per
+    output unit. Without `floor`, tensors that start at zero would never move.
     """
 
     def init(params: Any) -> optax.EmptyState:
@@ -46,8 +47,8 @@ def laprop(
         m <- beta1 * m + (1 - beta1) * g / (sqrt(v / (1 - beta2^t)) + eps)
         update = -learning_rate * m / (1 - beta1^t)
 
-    A parameter whose gradient has always been 0 does not move. A schedule is read at 0 for
-    the first update.
+    A parameter whose gradient has always been 0 does not move. The first update reads a
+    schedule at 0.
     """
     return optax.chain(
         optax.scale_by_rms(beta2, eps=eps, eps_in_sqrt=False, bias_correction=True),
@@ -57,10 +58,9 @@ def laprop(
 
 
 def make_laprop(config: LaPropConfig) -> optax.GradientTransformation:
-    """For all parameters: clipping, then LaProp, its rate rising from 0 over the warm-up.
+    """For all parameters: clipping, then LaProp with a warm-up of its learning rate.
 
-    The very first update has learning rate 0; update number `warmup_updates`, counted from
-    0, is the first at the full rate.
+    The rate rises linearly: it is 0 in update 0, and full from update `warmup_updates` on.
     """
     rate: optax.ScalarOrSchedule = config.learning_rate
     if config.warmup_updates > 0:
@@ -78,6 +78,16 @@ class Adams(NamedTuple):
     behaviour: optax.GradientTransformation
 
 
+class AdamStates(NamedTuple):
+    """The states of `Adams`."""
+
+    world_model: PyTree
+    behaviour: PyTree
+
+
+Optimizer: TypeAlias = optax.GradientTransformation | Adams
+
+
 def make_adams(config: AdamConfig) -> Adams:
     """Adam after clipping by the global norm."""
 
@@ -93,6 +103,26 @@ def make_adams(config: AdamConfig) -> Adams:
             config.behaviour_learning_rate, config.behaviour_clip, config.behaviour_epsilon
         ),
     )
+
+
+def make_optimizer(config: OptimizerConfig) -> Optimizer:
+    """One optimiser for all parameters, or one for the world model and one for the rest."""
+    if isinstance(config, LaPropConfig):
+        return make_laprop(config)
+    if isinstance(config, AdamConfig):
+        return make_adams(config)
+    raise TypeError(f"no optimiser for {type(config).__name__}")
+
+
+def init_optimizer(optimizer: Optimizer, params: Params) -> PyTree:
+    """The state of `optimizer` before the first update."""
+    if isinstance(optimizer, Adams):
+        behaviour = params.actor, params.critic
+        return AdamStates(
+            world_model=optimizer.world_model.init(params.world_model),
+            behaviour=optimizer.behaviour.init(behaviour),
+        )
+    return optimizer.init(params)
 
 
 def _norm(x: jax.Array) -> jax.Array:

@@ -21,7 +21,7 @@ from vawm.learning import replay
 from vawm.learning.collector import Collector, begin, make_collect
 from vawm.learning.from_replay import make_learn
 from vawm.learning.replay import Replay
-from vawm.learning.update import Learner, init_learner
+from vawm.learning.state import Learner, init_learner
 from vawm.types import Array, Key, Metrics, PyTree, Trajectory
 
 
