@@ -119,7 +119,7 @@ def drawn(monkeypatch):
         ),
         (
             ["--logdirs", "RUN", "--dept", "3"],
-            "--dept='3': no such flag; did you mean --depth",
+            "--dept='3': ",
         ),
     ],
 )

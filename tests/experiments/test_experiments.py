@@ -36,7 +36,7 @@ gradient_routes = load("gradient_routes")
         (
             benchmark,
             ["--agent", "storm", "--batch-length", "65"],
-            "batch_length=65: use at most 64, the transformer's positions",
+            "replay.batch_length=65: ",
         ),
         (benchmark, ["--task", "walker_wlak"], "task='walker_wlak': did you mean"),
         (benchmark, ["--num-envs", "0"], "num_envs=0: use a whole number of at least 1"),
