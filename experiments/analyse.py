@@ -43,8 +43,7 @@ from vawm.cli import command_line, flags
 from vawm.config import Config
 from vawm.envs.protocol import check_positive
 from vawm.errors import InvalidInput
-from vawm.policy import Policy
-from vawm.policy import policy as policy_lib
+from vawm.policy import Policy, load
 from vawm.process import cache, huge_pages
 from vawm.runs import run_folder
 from vawm.types import is_image
@@ -132,11 +131,11 @@ def prepare(options: Options) -> Loaded:
     figures.check()
     plays = options.what != "curves"
     loaded = Loaded(
-        policies={name: policy_lib.load(path) for name, path in called.items() if plays},
+        policies={name: load(path) for name, path in called.items() if plays},
         runs={
             name: curves.read(path) for name, path in called.items() if options.wants("curves")
         },
-        player=policy_lib.load(options.player) if plays and options.player else None,
+        player=load(options.player) if plays and options.player else None,
     )
     for name, policy in loaded.policies.items():
         check(options, name, policy, loaded.player)

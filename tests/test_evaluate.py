@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import tiny
 
-from vawm import config as config_lib
 from vawm import evaluate, presets
 from vawm.agent import make_agent
+from vawm.config import AtariConfig
 from vawm.envs import probes
 from vawm.errors import InvalidInput
 from vawm.learning import train
@@ -89,7 +89,7 @@ def test_a_policy_is_evaluated_by_the_protocol_of_its_suite(
     config, made, played = quick(suite), [], []
     if suite == "atari100k":
         other = {"sticky": 0.25, "life_loss": "end", "clip_reward": True}
-        config = dataclasses.replace(config, env=config_lib.AtariConfig(**other))
+        config = dataclasses.replace(config, env=AtariConfig(**other))
     if suite != "dmc_proprio":
         changes = changes | {"on_failure": "raise"}
     env = tiny.env()

@@ -1,10 +1,11 @@
-"""An exported policy: the same actions bit for bit, and a refusal for all that is not it."""
+"""An exported policy: the same actions bit for bit; damaged and foreign files are refused."""
 
 import dataclasses
 import errno
 import json
 import os
 import pathlib
+import re
 import shutil
 import subprocess
 import sys
@@ -17,13 +18,13 @@ import pytest
 import safetensors.numpy
 import tiny
 import toy
+from refusals import refused
 
 import vawm
-from vawm import config as config_lib
 from vawm import evaluate, export
 from vawm.agent import make_agent
+from vawm.config import GymnasiumConfig
 from vawm.envs.protocol import Environment
-from vawm.errors import InvalidInput
 from vawm.learning import train
 from vawm.policy import policy, weights
 from vawm.policy.play import Score
@@ -60,7 +61,7 @@ def copy(exported, tmp_path):
     return shutil.copytree(exported, tmp_path / "policy")
 
 
-def test_the_weights_come_back_bit_for_bit(logdir, exported):
+def test_the_weights_are_restored_bit_for_bit(logdir, exported):
     trained, loaded = policy.load(logdir), vawm.load(exported)
     toy.assert_equal((loaded.params, loaded.state), (trained.params, trained.state))
     assert loaded[:3] == trained[:3] == (tiny.CONFIG, tiny.env().spec, 32)
@@ -114,7 +115,7 @@ def test_a_process_that_never_trained_acts_bit_for_bit_the_same(logdir, exported
 
 
 def lines_of(text):
-    """The five lines of a text that has them indented."""
+    """The indented lines of a text."""
     return "\n".join(line[4:] for line in text.splitlines() if line.startswith("    "))
 
 
@@ -122,13 +123,11 @@ def lines_of(text):
     ("task", "changes"),
     [
         ("cartpole_swingup", {}),
-        ("CartPole-v1", {"suite": "gymnasium", "env": config_lib.GymnasiumConfig(workers=1)}),
+        ("CartPole-v1", {"suite": "gymnasium", "env": GymnasiumConfig(workers=1)}),
     ],
 )
-def test_the_lines_that_are_promised_act_in_a_process_that_never_trained(
-    tmp_path, task, changes
-):
-    """Those of the docstring and of the model card."""
+def test_the_documented_lines_act_in_a_process_that_never_trained(tmp_path, task, changes):
+    """The lines of the docstring and of the model card."""
     config = tiny.config(task=task, size="custom", **changes)
     made = suites.make(config)
     agent = make_agent(config, made.spec)
@@ -141,7 +140,7 @@ def test_the_lines_that_are_promised_act_in_a_process_that_never_trained(
     shown = card.partition("```python\n")[2].partition("```")[0]
     blocks = [shown.replace("FOLDER", "cartpole")]
     if not changes:
-        blocks.append(lines_of(export.__doc__.partition("Five lines")[2]))
+        blocks.append(lines_of(export.__doc__.partition("--episodes 10")[2]))
         assert len(blocks[-1].splitlines()) == 5
     check = "assert action.shape[1] == policy.spec.action_size\n"
     subprocess.run(
@@ -154,17 +153,23 @@ def test_the_lines_that_are_promised_act_in_a_process_that_never_trained(
 
 
 @pytest.mark.parametrize("task", [tiny.CONFIG.task, "cartpole_swingup"])
-def test_the_card_of_an_environment_of_ones_own_says_so(exported, task):
+def test_the_card_of_a_users_environment_does_not_make_it(exported, task):
     """Whatever task its config has, such as that of a preset."""
     loaded = vawm.load(exported)
     config = dataclasses.replace(loaded.config, task=task)
-    assert "timestep)  # of your own" in export.card(loaded._replace(config=config), "")
+    card = export.card(loaded._replace(config=config), "")
+    assert "policy.act(" in card
+    assert "make(" not in card
 
 
-def test_a_policy_of_another_version_is_told_in_the_log(exported, monkeypatch, caplog):
+def test_a_policy_of_another_version_is_loaded_with_a_warning(exported, monkeypatch, caplog):
+    before = manifest.version()
     monkeypatch.setattr(manifest, "version", lambda: "9.9.9")
     vawm.load(exported)
-    assert "this is vawm 9.9.9: that it acts the same is not promised" in caplog.text
+    [record] = [record for record in caplog.records if record.name == "vawm"]
+    assert record.levelname == "WARNING"
+    assert f"vawm {before}" in record.getMessage()
+    assert "vawm 9.9.9" in record.getMessage()
 
 
 @pytest.mark.parametrize("dtype", [jnp.bfloat16, jnp.float16, jnp.int32, bool])
@@ -179,7 +184,7 @@ def test_every_dtype_and_the_state_of_a_world_model_are_kept(tmp_path, dtype):
     assert (description.config, description.spec) == (tiny.CONFIG, spec)
     shapes = jax.eval_shape(lambda: (params, state))
     toy.assert_equal(weights.read(folder, description, *shapes), (params, state))
-    with pytest.raises(InvalidInput, match=r"output=.*exists"):
+    with refused("output", str(folder)):
         weights.write(folder, {}, {}, config=tiny.CONFIG, spec=spec, env_steps=1, card="")
 
 
@@ -203,8 +208,8 @@ def test_the_card_says_what_was_trained_and_that_it_was_not_evaluated(exported):
         "| env steps | 32 of 96, action repeat 1 |",
         "| seed | 0 |",
         "| value alignment | weight 1 / max(1, KL) after a warm-up of 24 env steps |",
-        "Not evaluated. Last return of training: 0.2, the mean over 3 episodes that ended "
-        "shortly before 16 env steps",
+        "Not evaluated",
+        "0.2, the mean over 3 episodes that ended shortly before 16 env steps",
         "python -m vawm.evaluate --logdir FOLDER",
         "Apache-2.0",
     ]:
@@ -214,7 +219,7 @@ def test_the_card_says_what_was_trained_and_that_it_was_not_evaluated(exported):
 def test_the_card_has_the_scores_of_an_evaluation_and_its_protocol(logdir, tmp_path):
     folder = export.export(logdir, tmp_path / "policy", scores=Score((1.0, 3.0)))
     text = (folder / weights.CARD).read_text()
-    assert "Evaluation: return 2.0 +- 1.0 over 2 episodes (whole episodes of 1000" in text
+    assert "return 2.0 +- 1.0 over 2 episodes (whole episodes of 1000" in text
     assert "Not evaluated" not in text
 
 
@@ -228,7 +233,7 @@ def changed(**changes):
     [
         (changed(weight="off"), "off"),
         (changed(weight="static", warmup_steps=8), "weight 0.5 after a warm-up of 8 env steps"),
-        (changed(), "not active yet: the warm-up of 10,000 env steps was not over"),
+        (changed(), "not active: training ended within the warm-up of 10,000 env steps"),
         (
             changed(warmup_unit="updates", warmup_steps=5),
             "weight 1 / max(1, KL) after a warm-up of 5 updates",
@@ -251,21 +256,21 @@ def test_nothing_is_ever_overwritten(logdir, tmp_path, kind):
         (there / "mine").write_text("precious")
     else:
         there.write_text("precious")
-    with pytest.raises(InvalidInput, match=r"output=.*exists"):
+    with refused("output", str(there)):
         export.export(logdir, there)
     assert sum(path.is_file() for path in tmp_path.rglob("*")) == 1
 
 
 def test_a_config_that_could_not_be_loaded_is_not_written(tmp_path):
     config, spec = tiny.config(seed=-1), tiny.env().spec
-    with pytest.raises(InvalidInput, match="seed=-1"):
+    with refused("seed", -1):
         weights.write(
             tmp_path / "policy", {}, {}, config=config, spec=spec, env_steps=1, card=""
         )
     assert not list(tmp_path.iterdir())
 
 
-def test_an_empty_folder_is_taken(logdir, tmp_path):
+def test_an_empty_folder_is_accepted(logdir, tmp_path):
     (tmp_path / "policy").mkdir()
     assert weights.found(export.export(logdir, tmp_path / "policy"))
 
@@ -275,17 +280,17 @@ def test_a_full_disk_leaves_nothing(logdir, tmp_path, monkeypatch):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(pathlib.Path, "write_text", full)
-    with pytest.raises(SaveError, match=r"could not be written: .*No space left"):
+    with pytest.raises(SaveError, match="No space left"):
         export.export(logdir, tmp_path / "policy")
     assert not list(tmp_path.iterdir())
 
 
 def rewrite(folder, change):
-    """Replaces the weights, checksum included, by what `change` makes of them."""
+    """Replaces the weights by `change(weights)`, and updates the checksum."""
     stored = change(safetensors.numpy.load_file(folder / weights.MODEL))
     safetensors.numpy.save_file(stored, folder / weights.MODEL)
     content = json.loads((folder / weights.CONFIG).read_text())
-    content["sha256"] = weights.manifest_lib.sha256(folder / weights.MODEL)
+    content["sha256"] = manifest.sha256(folder / weights.MODEL)
     (folder / weights.CONFIG).write_text(json.dumps(content))
 
 
@@ -296,24 +301,21 @@ def first(stored):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda s: {k: v for k, v in s.items() if k != first(s)}, "is missing, expected float"),
-        (lambda s: s | {"more": np.zeros(2, np.float32)}, r"more is float32\[2\], expected no"),
-        (
-            lambda s: s | {first(s): np.zeros((5, 7), np.float32)},
-            r"is float32\[5,7\], expected",
-        ),
+        (lambda s: {k: v for k, v in s.items() if k != first(s)}, "missing, .*float32"),
+        (lambda s: s | {"more": np.zeros(2, np.float32)}, r"more is float32\[2\]"),
+        (lambda s: s | {first(s): np.zeros((5, 7), np.float32)}, r"is float32\[5,7\]"),
         (
             lambda s: s | {first(s): s[first(s)].astype(ml_dtypes.bfloat16)},
-            r"is bfloat16\[.*\], expected float32",
+            r"is bfloat16\[.*\], .*float32",
         ),
-        (lambda s: {k + "x": v for k, v in s.items()}, "and [0-9]+ more: these are not"),
+        (lambda s: {k + "x": v for k, v in s.items()}, "and [0-9]+ more"),
     ],
 )
 def test_weights_of_another_model_are_a_difference_in_one_line(copy, change, message):
     rewrite(copy, change)
-    with pytest.raises(InvalidInput, match=message) as error:
+    with refused("weights", str(copy / weights.MODEL), naming=weights.CONFIG) as error:
         vawm.load(copy)
-    assert "\n" not in str(error.value)
+    assert re.search(message, error.value.remedy)
 
 
 def flip(data):
@@ -321,48 +323,39 @@ def flip(data):
 
 
 @pytest.mark.parametrize(
-    ("name", "change", "message"),
+    ("name", "change", "named"),
     [
-        ("model.safetensors", flip, "does not match its checksum"),
+        ("model.safetensors", flip, "checksum"),
         ("model.safetensors", lambda data: data[:-8], "not fully covered"),
         ("model.safetensors", lambda data: b"", "header too small"),
-        ("model.safetensors", None, "model.safetensors'"),
-        ("config.json", lambda data: data[:50], "is no description of a policy"),
-        ("config.json", lambda data: b"[]", "is no description of a policy"),
-        ("config.json", lambda data: b"\xff\xfe", "is no description of a policy"),
-        ("config.json", None, "is no description of a policy .No such file"),
-        ("config.json", lambda data: b"[" * 200_000, "is no description of a policy"),
-        ("config.json", lambda data: data + b" " * 2**24, "more than the 16777216 bytes"),
+        ("model.safetensors", None, ""),
+        ("config.json", lambda data: data[:50], "JSONDecodeError"),
+        ("config.json", lambda data: b"[]", "TypeError"),
+        ("config.json", lambda data: b"\xff\xfe", "JSONDecodeError"),
+        ("config.json", None, "No such file"),
+        ("config.json", lambda data: b"[" * 200_000, "RecursionError"),
+        ("config.json", lambda data: data + b" " * 2**24, "16777216"),
         ("config.json", lambda data: data.replace(b": 32,", b": Infinity,"), "OverflowError"),
-        (
-            "config.json",
-            lambda data: data.replace(b'"schema": 1', b'"schema": 2'),
-            "its layout is not known; .* use the one that wrote it, or export it again",
-        ),
+        ("config.json", lambda data: data.replace(b'"schema": 1', b'"schema": 2'), "schema=2"),
         ("config.json", lambda data: data.replace(b'"seed": 0', b'"seed": -1'), "seed=-1"),
-        (
-            "config.json",
-            lambda data: data.replace(b'"seed"', b'"sede"'),
-            "sede=0: is not known; another state of vawm",
-        ),
-        ("config.json", lambda data: data.replace(b'"obs"', b'"abs"'), "obs is missing"),
+        ("config.json", lambda data: data.replace(b'"seed"', b'"sede"'), "sede=0"),
+        ("config.json", lambda data: data.replace(b'"obs"', b'"abs"'), "obs"),
     ],
 )
-def test_a_damaged_file_is_one_line(copy, name, change, message):
+def test_a_damaged_file_is_one_line(copy, name, change, named):
     path = copy / name
     if change is None:
         path.unlink()
     else:
         path.write_bytes(change(path.read_bytes()))
-    with pytest.raises(InvalidInput, match=message) as error:
+    with refused("weights", str(path), naming=named):
         vawm.load(copy)
-    assert "\n" not in str(error.value)
 
 
 def test_a_folder_of_a_run_is_not_taken_for_an_export(logdir, tmp_path):
     assert not weights.found(logdir)
     assert not weights.found(tmp_path)
-    with pytest.raises(InvalidInput, match="holds no checkpoint"):
+    with refused("logdir", str(tmp_path)):
         vawm.load(tmp_path)
 
 
@@ -374,7 +367,7 @@ def test_the_command_line_evaluates_and_exports(logdir, tmp_path, monkeypatch, c
     asked = []
 
     def fake(policy, **kwargs):
-        """Plays while the run goes on."""
+        """Plays while the run continues."""
         asked.append((policy.env_steps, kwargs))
         agent, key = make_agent(tiny.CONFIG, policy.spec), jax.random.key(1)
         newer = train.init(tiny.env(), agent, tiny.CONFIG, key)
@@ -390,16 +383,16 @@ def test_the_command_line_evaluates_and_exports(logdir, tmp_path, monkeypatch, c
     assert "return 2.0 +- 1.0 over 2 episodes" in capsys.readouterr().out
     assert "2.0 +- 1.0" in (tmp_path / "policy" / weights.CARD).read_text()
     assert vawm.load(logdir).env_steps == 40
-    assert vawm.load(tmp_path / "policy").env_steps == 32  # which the score is of
+    assert vawm.load(tmp_path / "policy").env_steps == 32  # the policy with the score
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--logdir", "."], "--output=None: is required"),
-        (["--logdir", ".", "--output", "."], "output='.': exists; choose another --output"),
-        (["--logdir", ".", "--output", "new"], "logdir='.': holds no checkpoint"),
-        (["--logdir", ".", "--output", "new", "--episodes", "-1"], "episodes=-1: use a whole"),
+        (["--logdir", "."], "--output=None: "),
+        (["--logdir", ".", "--output", "."], "output='.': "),
+        (["--logdir", ".", "--output", "new"], "logdir='.': "),
+        (["--logdir", ".", "--output", "new", "--episodes", "-1"], "episodes=-1: "),
     ],
 )
 def test_bad_input_is_one_line_and_code_2(tmp_path, monkeypatch, capsys, words, message):

@@ -10,8 +10,8 @@ import runs
 import tiny
 from gymnasium.envs.classic_control import CartPoleEnv
 
-from vawm import config as config_lib
 from vawm import envs, evaluate, presets
+from vawm.config import GymnasiumConfig
 from vawm.runs import checkpoint, runner
 
 CONFIG = tiny.config(
@@ -87,7 +87,7 @@ def test_the_readme_stacks_seeds(monkeypatch):
 
 
 def test_the_readme_trains_in_an_environment_of_ones_own(tmp_path, monkeypatch):
-    settings = {"suite": "gymnasium", "env": config_lib.GymnasiumConfig(workers=1)}
+    settings = {"suite": "gymnasium", "env": GymnasiumConfig(workers=1)}
     monkeypatch.setattr(presets, "GYMNASIUM_QUICK", tiny.config(**settings))
     monkeypatch.chdir(tmp_path)
     exec(snippet("from_gymnasium"), {"MyEnv": CartPoleEnv})

@@ -1,8 +1,8 @@
-"""A trained policy as a folder to share: weights, configuration, model card.
+"""Exports a trained policy to a folder: weights, configuration, model card.
 
     python -m vawm.export --logdir runs/... --output cartpole --episodes 10
 
-Five lines load it and act, wherever vawm is installed; no run and no checkpoint is needed:
+Wherever vawm is installed, five lines load it and act, without the run's folder:
 
     import jax, vawm
     policy = vawm.load("cartpole")
@@ -10,8 +10,8 @@ Five lines load it and act, wherever vawm is installed; no run and no checkpoint
     _, timestep = env.reset(jax.random.key(0))
     carry, action = policy.act(jax.random.key(1), policy.initial(1), timestep)
 
-`python -m vawm.evaluate --logdir cartpole` evaluates it. The files are those of
-`vawm.policy.weights`.
+`python -m vawm.evaluate --logdir cartpole` evaluates it. `vawm.policy.weights` describes the
+files.
 """
 
 from __future__ import annotations
@@ -28,30 +28,30 @@ from vawm.cli import flags
 from vawm.cli.command_line import guard
 from vawm.config import Config
 from vawm.errors import InvalidInput
-from vawm.policy import Policy, weights
-from vawm.policy import policy as policy_lib
+from vawm.policy import Policy, load, weights
 from vawm.policy.play import Score
 from vawm.process import cache, huge_pages
 from vawm.runs import suites
-from vawm.runs.checkpoint import manifest as manifest_lib
+from vawm.runs.checkpoint import manifest
 from vawm.runs.reports import tracking
 
 LOAD = """\
 import jax, vawm
 
-policy = vawm.load("FOLDER")  # this one
+policy = vawm.load("FOLDER")  # this folder
 """
 USAGE = f"""{LOAD}\
 env = vawm.envs.make(policy.spec.task, num_envs=1, action_repeat=policy.spec.action_repeat)
 _, timestep = env.reset(jax.random.key(0))
 carry, action = policy.act(jax.random.key(1), policy.initial(1), timestep)"""
-HOST_USAGE = f"""{LOAD}\
-with vawm.runs.suites.make(policy.config) as env:  # as in training, in processes of its own
+HOST_USAGE = f"""from vawm.runs import suites
+{LOAD}\
+with suites.make(policy.config) as env:  # as in training, in separate processes
     carry, timestep = policy.initial(env.spec.num_envs), env.reset(0)
     carry, action = policy.act(jax.random.key(1), carry, timestep)"""
 OWN_USAGE = f"""{LOAD}\
-carry, action = policy.act(jax.random.key(1), policy.initial(1), timestep)  # of your own"""
-"""How to act once, for the model card: on MJX, on the host, in an environment of one's own."""
+carry, action = policy.act(jax.random.key(1), policy.initial(1), timestep)  # your timestep"""
+"""How to act once, for the model card: on MJX, on the host, in the user's environment."""
 
 
 def export(
@@ -66,22 +66,23 @@ def export(
 
     Args:
       logdir: folder of a run.
-      folder: not there yet, or empty.
-      policy: which `logdir` was loaded before, such as the one that `scores` are of: a run
-        that goes on has a newer checkpoint by then.
-      scores: of an evaluation; without them the model card has the last return of training.
-      protocol: how they were obtained; that of the suite, with sampled actions, if not given.
+      folder: new or empty.
+      policy: the policy to write, if it was loaded from `logdir` before, for example to
+        measure `scores`. (The run may have a newer checkpoint by now.)
+      scores: of an evaluation; without them the model card has the last training return.
+      protocol: how the scores were measured; default the suite's protocol with sampled
+        actions.
 
     Returns:
       The folder.
 
     Raises:
       InvalidInput: no checkpoint, or a folder that is not empty; nothing was written.
-      SaveError: the disk is full; nothing is left behind.
+      SaveError: writing failed, for example on a full disk; leaves no files behind.
     """
     logdir, folder = pathlib.Path(logdir).expanduser(), pathlib.Path(folder).expanduser()
     weights.check_output(folder)
-    policy = policy or policy_lib.load(logdir)
+    policy = policy or load(logdir)
     measured = _last_return(logdir, policy.env_steps)
     if scores is not None:
         protocol = protocol or f"{suites.of(policy.config).protocol.text}; actions sampled"
@@ -99,7 +100,7 @@ def export(
 
 
 def _last_return(logdir: pathlib.Path, env_steps: int) -> str:
-    """What training measured last, and that it is no evaluation."""
+    """The last return of training as a sentence, which says that it is not an evaluation."""
     path = logdir / tracking.METRICS
     lines = [
         entry
@@ -107,17 +108,17 @@ def _last_return(logdir: pathlib.Path, env_steps: int) -> str:
         if entry["env_steps"] <= env_steps and entry.get("episode/return") is not None
     ]
     if not lines:
-        return "Not evaluated, and no episode of training has a recorded return."
+        return "Not evaluated, and training recorded no return."
     last = lines[-1]
     return (
-        f"Not evaluated. Last return of training: {last['episode/return']:.1f}, the mean over "
+        f"Not evaluated. Last training return: {last['episode/return']:.1f}, the mean over "
         f"{last['episode/count']} episodes that ended shortly before {last['env_steps']} env "
         "steps, with the rewards and the exploration of training."
     )
 
 
 def card(policy: Policy, measured: str) -> str:
-    """The text of `README.md`; `measured` says what the policy scores and how that is known."""
+    """The text of `README.md`; `measured` is the sentence about the policy's score."""
     config, spec = policy.config, policy.spec
     rows = {
         "task": f"{spec.task} ({config.suite})",
@@ -128,7 +129,7 @@ def card(policy: Policy, measured: str) -> str:
         f"action repeat {spec.action_repeat}",
         "seed": config.seed,
         "value alignment": _alignment(config, policy.env_steps),
-        "written by": f"vawm {manifest_lib.version()}",
+        "written by": f"vawm {manifest.version()}",
     }
     table = "\n".join(f"| {name} | {value} |" for name, value in rows.items())
     return f"""---
@@ -153,19 +154,19 @@ tags: [reinforcement-learning, world-model, jax]
 {_usage(policy)}
 ```
 
-Evaluate it with `python -m vawm.evaluate --logdir FOLDER`. All choices of the training are in
-`{weights.CONFIG}`.
+Evaluate it with `python -m vawm.evaluate --logdir FOLDER`. `{weights.CONFIG}` has all training
+settings.
 
 ## Licence
 
-Apache-2.0, as vawm itself.
+Apache-2.0, as vawm.
 """
 
 
 def _usage(policy: Policy) -> str:
     """The lines that load the policy and act once."""
     config = policy.config
-    try:  # not the task of the config, which says nothing of an environment of one's own
+    try:  # the task of the spec: the config's says nothing about a user's environment
         suites.check_task(dataclasses.replace(config, task=policy.spec.task))
     except InvalidInput:
         return OWN_USAGE
@@ -173,13 +174,13 @@ def _usage(policy: Policy) -> str:
 
 
 def _alignment(config: Config, env_steps: int) -> str:
-    """Whether L_var was part of what was learned."""
+    """Whether and how training used L_var."""
     alignment = config.value_alignment
     if alignment.weight == "off":
         return "off"
     warmup, unit = alignment.warmup_steps, alignment.warmup_unit.replace("_", " ")
     if alignment.warmup_unit == "env_steps" and env_steps <= warmup:
-        return f"not active yet: the warm-up of {warmup:,} env steps was not over"
+        return f"not active: training ended within the warm-up of {warmup:,} env steps"
     weight = {
         "adaptive": "weight 1 / max(1, KL)",
         "static": f"weight {alignment.static_weight:g}",
@@ -189,24 +190,24 @@ def _alignment(config: Config, env_steps: int) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Write the policy of a run's newest checkpoint to a folder of its own."""
+    """Write the policy of a run's newest checkpoint to a new folder."""
 
     logdir: pathlib.Path
     """folder of the run"""
     output: pathlib.Path
-    """folder to write; not there yet, or empty"""
+    """folder to write; new or empty"""
     episodes: int = 0
-    """play so many by the protocol of the suite, for the model card; 0 for none"""
+    """episodes to play by the suite's protocol, for the model card; 0 for none"""
     seed: int = 0
-    """of these episodes"""
+    """seed of these episodes"""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Prints where the policy is; returns the exit code."""
+    """Exports, prints the folder, and returns the exit code."""
     arguments = flags.read(Arguments, argv, description=__doc__)
     weights.check_output(arguments.output.expanduser())
     evaluate.check(arguments.episodes or 1, arguments.seed)
-    policy, scores = policy_lib.load(arguments.logdir), None
+    policy, scores = load(arguments.logdir), None
     if arguments.episodes:
         cache.enable()
         scores = evaluate.by_protocol(policy, episodes=arguments.episodes, seed=arguments.seed)

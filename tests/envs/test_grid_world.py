@@ -1,4 +1,4 @@
-"""The grid world: its rules, its pixels, and Gymnasium's own opinion of it."""
+"""The grid world: its rules, its pixels, and Gymnasium's checks."""
 
 import gymnasium
 import numpy as np
@@ -39,7 +39,7 @@ def test_an_episode_has_50_steps():
         (3, (0, 1), (1, 3)),
     ],
 )
-def test_steps_move_one_field_and_edges_stop(world, action, moved, stopped):
+def test_steps_move_one_field_and_edges_stop_the_walker(world, action, moved, stopped):
     world.goal = np.array([3, 3])
     world.walker = np.array([1, 1])
     world.step(action)
@@ -49,7 +49,7 @@ def test_steps_move_one_field_and_edges_stop(world, action, moved, stopped):
     assert tuple(world.walker) == stopped
 
 
-def test_a_goal_that_is_reached_is_rewarded_once_and_moves(world):
+def test_reaching_a_goal_is_rewarded_once_and_moves_it(world):
     world.walker, world.goal = np.array([2, 2]), np.array([2, 3])
     picture, reward, *_ = world.step(3)
     assert reward == 1.0

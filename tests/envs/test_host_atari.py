@@ -1,4 +1,4 @@
-"""Atari: what is seen, when episodes end, and that a seed is a game."""
+"""Atari: observations, ends of episodes, and games that depend only on their seed."""
 
 import dataclasses
 import inspect
@@ -7,6 +7,7 @@ import typing
 
 import numpy as np
 import pytest
+from refusals import refused
 
 from vawm import config
 from vawm.envs.host import atari
@@ -156,7 +157,7 @@ def frames():
 @pytest.mark.parametrize("size", [64, 84, 31])
 @pytest.mark.parametrize("method", RESIZES)
 def test_resizes_match_their_float64_twins(frames, method, size):
-    """Bit for bit, but where the exact value is a half and its rounding a matter of luck."""
+    """Bit for bit, except where the exact value is a half, which may round either way."""
     resize = make_resize(method, height=210, width=160, size=size)
     for frame in frames:
         actual, expected = resize(frame), TWINS[method](frame, size)
@@ -202,7 +203,7 @@ def test_resizes_by_hand():
 
 @pytest.mark.parametrize("game", ["breakout", "ms_pacman", "krull", "up_n_down"])
 def test_area_frames_are_those_of_ales_own_vector_environment_and_bilinear_ones_are_not(game):
-    """Why we have our own: ALE's cannot show what DreamerV3 was trained on."""
+    """ALE's vector environment cannot return the frames that DreamerV3 was trained on."""
     vector = ale_py.vector_env.AtariVectorEnv(
         game,
         num_envs=1,
@@ -227,7 +228,7 @@ def test_area_frames_are_those_of_ales_own_vector_environment_and_bilinear_ones_
         assert terminated[0] == outcome.is_terminal
         assert not truncated[0]
         rewards += outcome.reward
-        if outcome.is_last:  # where a step is cut short, theirs shows frames of the step before
+        if outcome.is_last:  # after a short step, ALE's shows frames of the step before
             break
         np.testing.assert_array_equal(theirs[0, 0], outcome.obs)
         differences.append(np.abs(outcome.obs.astype(int) - other.obs).max())
@@ -302,7 +303,7 @@ def test_a_lost_life_is_ignored():
     assert last.is_last
 
 
-def test_a_terminal_lost_life_stops_the_step_and_the_game_goes_on():
+def test_a_terminal_lost_life_stops_the_step_and_the_game_continues():
     ignore, terminal = simulate("breakout"), simulate("breakout", life_loss="terminal")
     actions = random_actions(ignore, 2000)
     ignored = episode(ignore, 0, actions)[1:]
@@ -314,7 +315,7 @@ def test_a_terminal_lost_life_stops_the_step_and_the_game_goes_on():
 
     _, steps = screens("breakout", actions)
     frames = [screen for screen, lives in steps[lost[0]] if lives == 5]
-    assert len(frames) < 3  # so that the skip would have gone on
+    assert len(frames) < 3  # the frame skip would have continued
     frames.append(steps[lost[0]][len(frames)][0])
     resize = make_resize("bilinear", height=210, width=160, size=64)
     seen = np.stack(frames)[-2:].max(axis=0)
@@ -339,7 +340,7 @@ def test_a_lost_life_can_end_the_episode_at_that_frame_and_a_new_game_follows():
     assert_same([first, *outcomes], episode(simulator, 1, actions))  # five lives again
 
 
-def test_the_last_life_counts_where_the_game_shows_it_as_none():
+def test_the_last_life_counts_if_the_game_shows_it_as_0():
     simulator = simulate("bank_heist", life_loss="terminal")
     outcomes = episode(simulator, 0, random_actions(simulator, 3000))[1:]
     assert outcomes[-1].is_last
@@ -357,7 +358,7 @@ def test_freeway_has_no_lives_and_ends_when_its_time_is_up():
 
 
 @pytest.mark.parametrize("noops", [0, 30])
-def test_the_limit_of_frames_cuts_a_game_and_does_not_end_it(noops):
+def test_the_frame_limit_truncates_a_game_and_does_not_terminate_it(noops):
     """Ten frames are two and a half steps; no-ops do not count."""
     simulator = simulate("freeway", max_frames=10, noops=noops)
     for seed in range(3):
@@ -366,7 +367,7 @@ def test_the_limit_of_frames_cuts_a_game_and_does_not_end_it(noops):
         assert not any(outcome.is_terminal for outcome in outcomes)
 
 
-def test_a_game_that_is_over_at_the_limit_has_ended_and_one_frame_before_it_has_not():
+def test_a_game_that_is_over_at_the_frame_limit_is_terminal():
     actions = random_actions(simulate("breakout"), 1000)
     _, steps = screens("breakout", actions)
     length = sum(map(len, steps))
@@ -389,7 +390,7 @@ def test_ale_itself_never_ends_a_game():
 
 @pytest.mark.parametrize("game", atari.GAMES)
 def test_an_episode_depends_on_its_seed_and_its_actions_alone(game):
-    """ALE's own reset fails this in ten of the games, a restored state in qbert.
+    """ALE's reset fails this in ten of the games, a restored state fails it in qbert.
 
     A reset draws random numbers that some games only feel the third time.
     """
@@ -436,8 +437,8 @@ def test_the_first_observation_is_the_screen_after_the_no_ops():
         np.testing.assert_array_equal(obs, resize(screen))
 
 
-def test_a_game_that_is_over_among_its_no_ops_begins_again():
-    """Left alone, assault is over after 642 frames."""
+def test_a_game_that_ends_during_its_no_ops_is_restarted():
+    """Without actions, assault is over after 642 frames."""
     simulator = simulate("assault", noops=1200)
     drawn, begun = [], []
     for seed in range(8):
@@ -450,7 +451,7 @@ def test_a_game_that_is_over_among_its_no_ops_begins_again():
 
 
 class Recorder:
-    """An ALE that writes down what is pressed."""
+    """An ALE that records the actions it gets."""
 
     def __init__(self, ale):
         self.ale = ale
@@ -465,7 +466,7 @@ class Recorder:
 
 
 def pressed(simulator, seed, actions):
-    """`[T, frame_skip]` what the console got, action index by action index."""
+    """`[T, frame_skip]` action indices that the console got."""
     index = {action: i for i, action in enumerate(simulator._actions)}
     recorder = simulator._ale = Recorder(simulator._ale)
     episode(simulator, seed, actions)
@@ -478,8 +479,8 @@ def test_sticky_actions_repeat_the_frame_before_with_their_probability():
     actions = 1 + np.arange(1500) % 2  # another one at every step
     got = pressed(simulator, 0, actions)
     before = np.concatenate([[0], got.ravel()[:-1]]).reshape(-1, 4)
-    assert np.isin(got, [1, 2]).sum() >= got.size - 4  # nothing is pressed at most at the start
-    # Frame i still has the action of the step before where all up to it have stuck.
+    assert np.isin(got, [1, 2]).sum() >= got.size - 4  # no-ops only at the start
+    # Frame i has the action of the step before if all frames up to it were sticky.
     late = (got != actions[:, None]).mean(axis=0)
     np.testing.assert_allclose(late, 0.25 ** np.arange(1, 5), atol=0.03)
     changed = before != actions[:, None]  # where sticking can be seen
@@ -487,7 +488,7 @@ def test_sticky_actions_repeat_the_frame_before_with_their_probability():
     assert simulator._ale.getFloat("repeat_action_probability") == 0
 
 
-def test_sticky_actions_come_from_the_seed_and_an_episode_begins_with_none():
+def test_sticky_actions_come_from_the_seed_and_an_episode_starts_with_a_no_op():
     simulator = simulate("freeway", sticky=0.9)
     one, again, other = (pressed(simulator, seed, [1] * 20) for seed in (0, 0, 1))
     np.testing.assert_array_equal(one, again)
@@ -529,7 +530,7 @@ def test_the_simulator_offers_the_minimal_or_the_full_set_of_actions():
 def test_an_action_that_is_not_there_is_refused(action):
     simulator = simulate("pong")
     simulator.reset(0)
-    with pytest.raises(InvalidInput, match=r"action=-?\d+: use the index"):
+    with refused("action", action, naming="0 to 5"):
         simulator.step(action)
 
 
@@ -543,14 +544,12 @@ def test_an_action_that_is_not_there_is_refused(action):
     ],
 )
 def test_an_unknown_game_is_refused_with_the_nearest(name, nearest):
-    with pytest.raises(InvalidInput, match=f"did you mean '{nearest}'") as refusal:
+    with refused("game", name, naming=[f"'{nearest}'", "alien, amidar"]):
         simulate(name)
-    assert refusal.value.field == "game"
-    assert "choose one of alien, amidar" in str(refusal.value)
 
 
 def test_a_game_outside_of_the_26_is_refused():
-    with pytest.raises(InvalidInput, match="game='zaxxon': choose one of alien"):
+    with refused("game", "zaxxon", naming="alien, amidar"):
         atari.check_game("zaxxon")
 
 
@@ -578,17 +577,17 @@ def test_impossible_choices_are_refused(choices):
 
 def test_without_ale_py_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "ale_py", None)
-    with pytest.raises(InvalidInput, match=r'pip install "vawm\[atari\]"'):
+    with refused("game", "pong", naming='pip install "vawm[atari]"'):
         simulate("pong")
 
 
-def test_ale_keeps_quiet(capfd):
+def test_ale_prints_nothing(capfd):
     ale_py.ALEInterface.setLoggerMode(ale_py.LoggerMode.Info)
     simulate("pong").reset(0)
     assert capfd.readouterr() == ("", "")
 
 
-def test_what_the_simulator_asks_for_is_what_the_configuration_offers():
+def test_the_simulator_takes_exactly_the_fields_of_its_configuration():
     asked = inspect.signature(AtariSimulator).parameters.values()
     assert all(each.default is inspect.Parameter.empty for each in asked)
     asked = {each.name for each in asked if each.kind is inspect.Parameter.KEYWORD_ONLY}

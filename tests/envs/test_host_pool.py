@@ -1,4 +1,4 @@
-"""Pools: their stream, what follows when an environment fails, resuming, and their end."""
+"""Pools: their stream, failures of environments, resuming, and their end."""
 
 import contextlib
 import gc
@@ -16,6 +16,7 @@ import host_simulators
 import numpy as np
 import pytest
 from host_simulators import BadEnd, Chance, Changed, Echo, Parent, Slow, Troubled, Walk
+from refusals import refused
 
 from vawm.envs.host import channel, pool, worker
 from vawm.envs.host.pool import EnvironmentFailure, Episodes, Pool, episode_seed
@@ -60,7 +61,7 @@ def pids(envs):
 
 
 def alive(pid):
-    """Whether a process runs; one that only waits to be forgotten does not."""
+    """Whether a process runs; a zombie does not."""
     try:
         with open(f"/proc/{pid}/stat") as file:
             return file.read().rpartition(")")[2].split()[0] != "Z"
@@ -79,7 +80,7 @@ def wait_until(condition, seconds=10):
 
 
 @pytest.mark.parametrize("workers", [1, 2, 3])
-def test_a_stream_is_that_of_a_plain_loop_for_any_number_of_workers(walks, workers):
+def test_the_stream_equals_that_of_a_plain_loop_for_any_number_of_workers(walks, workers):
     actions = draw_actions(steps=20, num_envs=3)
     expected = host_simulators.serial_stream(Walk, SEED, actions)
     other = workers != 2 and Pool(Walk, task="walk", num_envs=3, workers=workers)
@@ -96,7 +97,7 @@ def test_a_stream_is_that_of_a_plain_loop_for_any_number_of_workers(walks, worke
         assert [x.dtype for x in timestep[1:]] == [np.float32, bool, bool, bool]
 
 
-def test_a_pool_says_what_its_environments_are(walks):
+def test_a_pool_describes_its_environments(walks):
     assert walks.spec == EnvSpec(
         task="walk",
         obs=Walk.obs,
@@ -108,10 +109,10 @@ def test_a_pool_says_what_its_environments_are(walks):
     )
 
 
-def test_a_reset_begins_everything_again(walks):
+def test_a_reset_starts_everything_again(walks):
     actions = draw_actions(steps=4, num_envs=3)
     first = [walks.reset(SEED), *play(walks, actions)]
-    walks.send(actions[0])  # and is not received
+    walks.send(actions[0])  # never received
     for a, b in zip(first, [walks.reset(SEED), *play(walks, actions)], strict=True):
         assert_equal(a, b)
     other = walks.reset(SEED + 1)
@@ -125,7 +126,7 @@ def test_time_steps_are_copies(walks):
     for (name, x), y in zip(pool.arrays_of(before), kept, strict=True):
         np.testing.assert_array_equal(x, y, err_msg=name)
         assert x.base is None, name
-        x[...] = 1  # and are the caller's to write to
+        x[...] = 1  # the caller may write to them
 
 
 def test_continuous_actions_are_clipped_and_nan_is_no_action():
@@ -154,51 +155,52 @@ def test_seeds_of_episodes_differ_and_fit_in_31_bits():
     assert all(0 <= seed < 2**31 for seed in seeds)
 
 
-# What is refused.
+# Refusals.
 
 
 @pytest.mark.parametrize(
-    ("choice", "match"),
+    ("field", "value", "named"),
     [
-        ({"num_envs": 0}, "num_envs=0"),
-        ({"action_repeat": 1.5}, "action_repeat=1.5"),
-        ({"workers": -1}, "workers=-1"),
-        ({"timeout": 0}, "timeout=0: use a positive number"),
-        ({"timeout": float("nan")}, "timeout=nan"),
-        ({"on_failure": "ignore"}, "on_failure='ignore': use 'raise' or 'restart'"),
+        ("num_envs", 0, ()),
+        ("action_repeat", 1.5, ()),
+        ("workers", -1, ()),
+        ("timeout", 0, ()),
+        ("timeout", float("nan"), ()),
+        ("on_failure", "ignore", ["'raise'", "'restart'"]),
     ],
 )
-def test_impossible_choices_are_refused(choice, match):
-    with pytest.raises(InvalidInput, match=match):
-        Pool(Walk, **{"task": "walk", "num_envs": 1, **choice})
+def test_impossible_choices_are_refused(field, value, named):
+    with refused(field, value, naming=named):
+        Pool(Walk, **{"task": "walk", "num_envs": 1, field: value})
 
 
-def test_a_factory_that_holds_on_to_this_process_is_refused():
+def test_a_factory_that_cannot_be_pickled_is_refused():
     lock = threading.Lock()
-    with pytest.raises(InvalidInput, match=r"^make=.*cannot be sent.*lock"):
-        Pool(lambda: Walk(lock), task="walk", num_envs=1)
+    make = lambda: Walk(lock)  # noqa: E731
+    with refused("make", make, naming="lock"):
+        Pool(make, task="walk", num_envs=1)
 
 
 def test_actions_of_another_shape_are_refused(walks):
     walks.reset(SEED)
-    with pytest.raises(InvalidInput, match=r"action=\(3,\).*\(3, 2\)"):
+    with refused("action", (3,), naming="(3, 2)"):
         walks.send(np.zeros(3))
     play(walks, np.zeros((1, 3, 2)))
 
 
 def test_calls_out_of_order_are_refused(walks):
     walks.reset(SEED)
-    with pytest.raises(RuntimeError, match=r"^send\(\) has to come first"):
+    with pytest.raises(RuntimeError, match=r"send\(\)"):
         walks.receive()
     walks.send(np.zeros((3, 2)))
-    with pytest.raises(RuntimeError, match=r"^receive\(\) has to come first"):
+    with pytest.raises(RuntimeError, match=r"receive\(\)"):
         walks.send(np.zeros((3, 2)))
     walks.receive()
 
 
 @pytest.mark.parametrize("seed", [-1, 1.5, True, None])
 def test_an_impossible_seed_is_refused(walks, seed):
-    with pytest.raises(InvalidInput, match="seed="):
+    with refused("seed", seed):
         walks.reset(seed)
 
 
@@ -208,19 +210,19 @@ def test_an_impossible_seed_is_refused(walks, seed):
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        ({"reward": float("nan")}, "reward is nan"),
-        ({"reward": 1e39}, r"reward is 1e\+39"),
-        ({"reward": None}, "reward is None, not a number"),
-        ({"reward": np.ones(1)}, r"reward is array\(\[1.\]\), not a number"),
-        ({"is_last": 1}, "is_last is 1, not True or False"),
-        ({"is_terminal": None}, "is_terminal is None"),
-        ({"obs": np.float32([0, np.inf])}, r"obs\[1\] is inf"),
-        ({"obs": np.zeros(2)}, r"obs is float64\[2\], not float32\[2\]"),
-        ({"obs": np.zeros((2, 1), np.float32)}, r"obs is float32\[2, 1\], not float32\[2\]"),
-        ({"obs": [0.0, 0.0]}, "obs is a list, not a numpy array"),
+        ({"reward": float("nan")}, "reward .*nan"),
+        ({"reward": 1e39}, r"reward .*1e\+39"),
+        ({"reward": None}, "reward .*None"),
+        ({"reward": np.ones(1)}, r"reward .*array\(\[1.\]\)"),
+        ({"is_last": 1}, "is_last .*1"),
+        ({"is_terminal": None}, "is_terminal .*None"),
+        ({"obs": np.float32([0, np.inf])}, r"obs\[1\] .*inf"),
+        ({"obs": np.zeros(2)}, r"obs .*float64\[2\].*float32\[2\]"),
+        ({"obs": np.zeros((2, 1), np.float32)}, r"obs .*float32\[2, 1\].*float32\[2\]"),
+        ({"obs": [0.0, 0.0]}, "obs .*list"),
     ],
 )
-def test_unsound_outcomes_are_named(change, reason):
+def test_invalid_outcomes_are_named(change, reason):
     class Still(Walk):
         obs = vector(2)
 
@@ -234,7 +236,7 @@ def test_unsound_outcomes_are_named(change, reason):
     (trouble,) = alone.answer(2, "step", {0: None}).troubles.values()
     assert not trouble.building
     assert re.match(reason, trouble.reason), trouble.reason
-    assert alone.arrays["reward"] == 0  # nothing of it was passed on
+    assert alone.arrays["reward"] == 0  # nothing was written
 
 
 @pytest.mark.parametrize("obs", [np.zeros(3, np.float32), {"state": np.zeros(3, np.float32)}])
@@ -245,10 +247,10 @@ def test_an_observation_without_all_its_entries_is_named(obs):
 
     alone = lone_worker(Half(), begins=False)
     (trouble,) = alone.answer(1, "begin", {0: 5}).troubles.values()
-    assert trouble.reason.endswith("not a dict of ['picture', 'state']")
+    assert "['picture', 'state']" in trouble.reason
 
 
-def test_rewards_may_be_scalars_of_numpy():
+def test_rewards_may_be_numpy_scalars():
     for reward in (np.float64(2), np.int8(2), np.array(2.0), True + True):
         assert worker.check_reward(reward) == 2
 
@@ -294,7 +296,7 @@ def test_a_message_longer_than_a_socket_takes_arrives_in_parts():
     with pytest.raises(TimeoutError):
         writer.send(message, timeout=0.01)
     with pytest.raises(TimeoutError):
-        reader.receive(deadline=time.monotonic() + 0.01)  # and what came is kept
+        reader.receive(deadline=time.monotonic() + 0.01)  # keeps the received part
     reader, writer = (channel.Channel(end) for end in socket.socketpair())
     thread = threading.Thread(target=writer.send, args=[message])
     thread.start()
@@ -326,21 +328,21 @@ def test_arrays_are_shared_and_grow(memfd, monkeypatch):
 
 TIMEOUT = 1.5  # seconds; a step takes microseconds, on a machine that others use too
 FAILURES = {
-    "boom": "raised ValueError: boom, and more",
-    "leave": "raised SystemExit: 1",
-    "exit": "its worker exited with code 3",
-    "crash": "its worker was killed by SIGSEGV",
-    "hang": "timed out after 1.5 s",
-    "hang_deaf": "timed out after 1.5 s",
-    "lose_reward": "reward is nan",
+    "boom": "ValueError: boom, and more",
+    "leave": "SystemExit: 1",
+    "exit": "code 3",
+    "crash": "SIGSEGV",
+    "hang": "1.5 s",
+    "hang_deaf": "1.5 s",
+    "lose_reward": "nan",
 }
 SHOWN = {"boom": "in boom", "crash": "in crash", "hang": "in hang", "lose_reward": "in write"}
 FATAL = {"exit", "crash", "hang", "hang_deaf"}  # to the worker
 
 
 def troubled(*troubles, on_failure):
-    """Two walks in one worker; something happens in the second step of the first episodes
-    of the second walk."""
+    """Two walks in one worker. The second walk has `troubles`, one in the second step of each
+    of its first episodes."""
     plan = {episode_seed(SEED, 1, episode): what for episode, what in enumerate(troubles)}
     return Pool(
         lambda: Troubled(plan, step=2),
@@ -365,23 +367,24 @@ def test_a_failure_names_environment_and_step_and_ends_the_pool(trouble):
             envs.receive()
         assert time.monotonic() - began < 5
         failure = caught.value
-        assert str(failure) == f"environment 1, episode 0, step 2: {FAILURES[trouble]}"
+        assert str(failure) == f"environment 1, episode 0, step 2: {failure.reason}"
         assert (failure.environment, failure.episode, failure.step) == (1, 0, 2)
+        assert FAILURES[trouble] in failure.reason
         assert SHOWN.get(trouble, "") in failure.traceback
         assert not any(map(alive, workers))
-        with pytest.raises(RuntimeError, match="the pool is closed") as after:
+        with pytest.raises(RuntimeError, match="closed") as after:
             envs.send(actions[2])
         assert after.value.__cause__ is failure
 
 
-def test_a_failure_can_begin_a_new_episode_instead():
+def test_a_failure_can_start_a_new_episode_instead():
     with troubled(*FAILURES, on_failure="restart") as envs:
         envs.reset(SEED)
         restarts = 0
         for episode, trouble in enumerate(FAILURES, start=1):
             going, failed = play(envs, np.zeros((2, 2, 2)))
             assert not going.is_first[1], trouble
-            fatal = trouble in FATAL  # and takes the other environment with it
+            fatal = trouble in FATAL  # takes the other environment down too
             assert failed.is_first[1], trouble
             assert failed.is_first[0] >= fatal, trouble
             assert (failed.reward[1], failed.is_last[1]) == (0, False)
@@ -395,7 +398,7 @@ def test_a_failure_can_begin_a_new_episode_instead():
 
 @pytest.mark.parametrize("end", ["exit", "hang"])
 def test_a_broken_simulator_that_cannot_even_be_closed_is_replaced(end):
-    """It takes its worker with it, and the other environment in there."""
+    """It takes its worker down, with the other environment."""
     plan = {episode_seed(SEED, 1, 0): "boom"}
     settings = {"num_envs": 2, "workers": 1, "timeout": TIMEOUT, "on_failure": "restart"}
     with Pool(lambda: BadEnd(plan, step=2, end=end), task="bad", **settings) as envs:
@@ -419,9 +422,9 @@ def test_a_worker_that_is_killed_from_outside_is_noticed(on_failure):
             assert not timesteps[1].is_first.any()
             assert envs.restarts == 2
             return
-        reason = r"was killed by SIGKILL between calls of environments \[0, 2\]$"
-        with pytest.raises(EnvironmentFailure, match=f"environment 0.*step 2: .*{reason}"):
+        with pytest.raises(EnvironmentFailure, match=r"SIGKILL.*\[0, 2\]") as caught:
             play(envs, actions[1:])
+        assert (caught.value.environment, caught.value.step) == (0, 2)
 
 
 def test_failures_without_a_step_between_them_end_the_pool():
@@ -432,8 +435,9 @@ def test_failures_without_a_step_between_them_end_the_pool():
         actions = draw_actions(steps=5, num_envs=1)
         play(envs, actions[:2])
         assert envs.restarts == 2
-        with pytest.raises(EnvironmentFailure, match=r"episode 2, .*boom.*failure 3 in a row"):
+        with pytest.raises(EnvironmentFailure, match=r"boom.*3 failures") as caught:
             play(envs, actions[2:])
+        assert caught.value.episode == 2
 
 
 class Refusing(Walk):
@@ -442,26 +446,24 @@ class Refusing(Walk):
 
 
 @pytest.mark.parametrize(
-    ("make", "match"),
+    ("make", "reason"),
     [
-        (lambda: 1 / 0, "could not be made: raised ZeroDivisionError: division by zero"),
-        (lambda: os._exit(3), "could not be made: its worker exited with code 3"),
-        (lambda: time.sleep(1000), "could not be made: timed out after 2 s"),
+        (lambda: 1 / 0, "ZeroDivisionError: division by zero"),
+        (lambda: os._exit(3), "code 3"),
+        (lambda: time.sleep(1000), "2 s"),
     ],
 )
-def test_a_simulator_that_cannot_be_made_is_a_failure(make, match, monkeypatch):
-    if "timed out" in match:
+def test_a_simulator_that_cannot_be_made_is_a_failure(make, reason, monkeypatch):
+    if reason == "2 s":
         monkeypatch.setattr(pool, "START_TIMEOUT", 2.0)
-    with pytest.raises(EnvironmentFailure, match=match) as caught:
+    with pytest.raises(EnvironmentFailure, match=f"made.*{reason}") as caught:
         Pool(make, task="none", num_envs=1, timeout=TIMEOUT, on_failure="restart")
     assert caught.value.environment == 0
 
 
-def test_what_a_maker_refuses_reaches_the_caller():
-    with pytest.raises(InvalidInput) as caught:
+def test_a_refusal_of_the_simulators_maker_reaches_the_caller():
+    with refused("size", 7, naming="use an even number"):
         Pool(Refusing, task="none", num_envs=2, workers=1)
-    error = caught.value
-    assert (error.field, error.value, error.remedy) == ("size", 7, "use an even number")
 
 
 @pytest.mark.parametrize(
@@ -475,10 +477,10 @@ def test_what_a_maker_refuses_reaches_the_caller():
         ("episode_length", 1.5),
     ],
 )
-def test_a_simulator_that_is_none_is_named(name, value):
+def test_a_wrong_attribute_of_a_simulator_is_named(name, value):
     walk = Walk()
     setattr(walk, name, value)
-    with pytest.raises(TypeError, match=f"^{name}.*of the simulator is"):
+    with pytest.raises(TypeError, match=f"^{name}"):
         worker.describe_simulator(walk)
 
 
@@ -489,7 +491,7 @@ def test_environments_that_differ_are_refused(tmp_path):
         (tmp_path / "made").touch()
         return walk
 
-    with pytest.raises(InvalidInput, match=r"make='environment 1'.*equal simulators"):
+    with refused("make", "environment 1", naming=["action_size=1", "action_size=2"]):
         Pool(make, task="none", num_envs=2, workers=1)
 
 
@@ -502,7 +504,7 @@ def test_running_episodes_are_restored_wherever_they_were(walks):
     for action in actions:
         timesteps += play(walks, action[None])
         saved.append(walks.episodes())
-    walks.send(actions[0])  # episodes are those of the last step received
+    walks.send(actions[0])  # `episodes` is of the last received step
     assert_same_episodes(walks.episodes(), saved[-1])
 
     where = {"begun": 0, "amid": 0, "over": 0}
@@ -534,7 +536,7 @@ def assert_same_episodes(a: Episodes, b: Episodes):
         assert x.dtype == y.dtype
 
 
-def test_what_cannot_be_repeated_begins_a_new_episode():
+def test_an_episode_that_cannot_be_replayed_exactly_is_replaced_by_a_new_one():
     seed = next(
         seed
         for seed in range(100)
@@ -567,7 +569,7 @@ def test_a_step_that_is_off_by_one_bit_is_not_the_same(walks):
     assert not same.any()
 
 
-def test_an_episode_that_fails_when_played_again_begins_anew(tmp_path):
+def test_an_episode_that_fails_when_replayed_is_replaced_by_a_new_one(tmp_path):
     path = tmp_path / "order"
     actions = draw_actions(steps=4, num_envs=2)
     with Pool(lambda: Changed(path), task="c", num_envs=2, workers=1, timeout=TIMEOUT) as envs:
@@ -585,7 +587,7 @@ def test_an_episode_that_fails_when_played_again_begins_anew(tmp_path):
         assert envs.restore(SEED, episodes, before)[1].all()
 
 
-def test_an_episode_that_got_too_long_is_not_kept(walks, monkeypatch):
+def test_an_episode_that_is_too_long_is_not_kept(walks, monkeypatch):
     walks.reset(SEED)
     monkeypatch.setattr(pool, "MAX_KEPT", 2)
     lengths = []
@@ -603,11 +605,11 @@ def test_an_episode_that_got_too_long_is_not_kept(walks, monkeypatch):
 
 def test_episodes_of_other_environments_are_refused(walks):
     timestep, episodes = walks.reset(SEED), walks.episodes()
-    with pytest.raises(InvalidInput, match=r"episodes.actions=\(1, 2\).*\(0, 2\)"):
+    with refused("episodes.actions", (1, 2), naming="(0, 2)"):
         walks.restore(SEED, episodes._replace(actions=np.zeros((1, 2))), timestep)
-    with pytest.raises(InvalidInput, match=r"episodes.index=\(2,\)"):
+    with refused("episodes.index", (2,)):
         walks.restore(SEED, episodes._replace(index=np.zeros(2)), timestep)
-    with pytest.raises(InvalidInput, match=r"expected=.*float32\[3, 3\]"):
+    with refused("expected", naming="float32[3, 3]"):
         walks.restore(SEED, episodes, timestep._replace(obs=timestep.obs["state"]))
 
 
@@ -634,7 +636,7 @@ def test_after_an_interruption_a_pool_can_be_reset():
         signal.signal(signal.SIGALRM, previous)
 
 
-def test_workers_do_not_listen_to_signals_for_the_parent(walks):
+def test_workers_ignore_signals_meant_for_the_parent(walks):
     walks.reset(SEED)
     for pid in pids(walks):
         assert os.getpgid(pid) == pid  # Ctrl-C in a terminal does not reach it
@@ -643,7 +645,7 @@ def test_workers_do_not_listen_to_signals_for_the_parent(walks):
     assert not play(walks, np.zeros((1, 3, 2)))[0].is_first.any()
 
 
-def test_closing_leaves_no_process_behind_and_twice_is_once():
+def test_closing_leaves_no_process_behind_and_may_be_repeated():
     envs = Pool(Parent, task="parent", num_envs=2, workers=1)
     children = envs.reset(SEED).obs[:, 0].astype(int).tolist()
     workers = pids(envs)
@@ -651,11 +653,11 @@ def test_closing_leaves_no_process_behind_and_twice_is_once():
     envs.close()
     envs.close()
     assert wait_until(lambda: not any(map(alive, [*workers, *children])))
-    with pytest.raises(RuntimeError, match="the pool is closed"):
+    with pytest.raises(RuntimeError, match="closed"):
         envs.reset(SEED)
 
 
-def test_a_forgotten_pool_ends():
+def test_a_pool_that_is_garbage_collected_ends_its_workers():
     envs = Pool(Walk, task="walk", num_envs=1)
     workers = pids(envs)
     del envs
@@ -669,7 +671,7 @@ import numpy as np
 from host_simulators import Loud, Parent, Troubled
 from vawm.envs.host.pool import Pool
 
-class Here(Loud):  # known to this script alone
+class Here(Loud):  # defined only in this script
     pass
 
 def begin():
@@ -695,7 +697,7 @@ if sys.argv[1] == "loud":
     sys.stdin.readline()
     envs.send(np.zeros((2, 2)))
     envs.receive()
-    print("done", flush=True)  # and nothing is closed
+    print("done", flush=True)  # without closing the pool
 else:
     time.sleep(1000)
 """
@@ -703,7 +705,7 @@ else:
 
 @contextlib.contextmanager
 def script(*arguments):
-    """`SCRIPT`, which has no `if __name__ == "__main__"`, in a process group of its own."""
+    """Runs `SCRIPT`, which has no `if __name__ == "__main__"`, in a new process group."""
     with subprocess.Popen(
         [sys.executable, "-c", SCRIPT, *arguments],
         stdin=subprocess.PIPE,
@@ -728,7 +730,7 @@ def test_workers_end_with_a_parent_that_is_killed(thread):
         assert wait_until(lambda: not any(map(alive, workers)))
 
 
-def test_what_simulators_started_ends_with_a_parent_that_is_killed():
+def test_processes_of_simulators_end_with_a_parent_that_is_killed():
     with script("parent", "main") as (process, running):
         assert len(running) == 3  # two children of simulators, and their worker
         assert all(map(alive, running))
@@ -736,7 +738,7 @@ def test_what_simulators_started_ends_with_a_parent_that_is_killed():
         assert wait_until(lambda: not any(map(alive, running)))
 
 
-def test_chatter_that_nobody_can_hear_is_no_failure():
+def test_output_to_a_closed_standard_error_is_no_failure():
     with script("loud", "main") as (process, workers):
         process.stderr.close()
         assert all(map(alive, workers))
@@ -746,7 +748,7 @@ def test_chatter_that_nobody_can_hear_is_no_failure():
         assert process.wait(timeout=30) == 0
 
 
-def test_ctrl_c_is_for_the_parent_and_chatter_for_standard_error():
+def test_ctrl_c_reaches_only_the_parent_and_output_goes_to_standard_error():
     with script("loud", "main") as (process, workers):
         os.killpg(process.pid, signal.SIGINT)
         assert process.stdout.readline() == "interrupted\n"

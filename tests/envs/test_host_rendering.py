@@ -1,7 +1,7 @@
-"""Which backend renders, what is said where none does, and that a process keeps to one.
+"""Choosing a rendering backend, the messages if none works, and one backend per process.
 
-Whatever renders does so in a process of its own: one that has loaded a backend cannot load
-another, and those that run other tests are to have none.
+Rendering happens in separate processes: a process that has loaded a backend cannot load
+another, and processes that run other tests must not load one.
 """
 
 import ctypes.util
@@ -10,9 +10,9 @@ import subprocess
 import sys
 
 import pytest
+from refusals import refused
 
 from vawm.envs.host import rendering
-from vawm.errors import InvalidInput
 
 needs_egl = pytest.mark.skipif(
     ctypes.util.find_library("EGL") is None, reason=f"needs {rendering.PACKAGES['egl']}"
@@ -23,8 +23,8 @@ needs_osmesa = pytest.mark.skipif(
 
 
 @pytest.fixture(autouse=True)
-def nothing_remembered():
-    """Lets every test try the backends anew, and those after this module too."""
+def clear_the_cache():
+    """Makes every test try the backends again, and tests after this module too."""
     rendering.fault.cache_clear()
     yield
     rendering.fault.cache_clear()
@@ -32,21 +32,21 @@ def nothing_remembered():
 
 @pytest.fixture
 def without_egl(monkeypatch):
-    """No driver for EGL to find, as where libgl1-mesa-dri is not installed."""
+    """EGL finds no driver, as if libgl1-mesa-dri were not installed."""
     monkeypatch.setenv("__EGL_VENDOR_LIBRARY_DIRS", "/nonexistent")
     monkeypatch.setenv("__EGL_VENDOR_LIBRARY_FILENAMES", "/nonexistent")
 
 
 @pytest.fixture
 def without_osmesa(monkeypatch, tmp_path):
-    """OSMesa's library cannot be loaded, as where libosmesa6 is not installed."""
+    """OSMesa's library cannot be loaded, as if libosmesa6 were not installed."""
     for name in ("libOSMesa.so", "libOSMesa.so.6", "libOSMesa.so.8"):
         (tmp_path / name).touch()
     monkeypatch.setenv("LD_LIBRARY_PATH", str(tmp_path))
 
 
 def in_a_process(script: str, **variables: str) -> str:
-    """What a script prints in a process that has loaded nothing yet."""
+    """The output of a script in a new process."""
     done = subprocess.run(
         [sys.executable, "-c", script],
         env=os.environ | variables,
@@ -59,66 +59,53 @@ def in_a_process(script: str, **variables: str) -> str:
 
 
 @needs_egl
-def test_auto_takes_egl_where_it_works():
+def test_auto_takes_egl_if_it_works():
     assert rendering.choose("auto") == "egl"
 
 
 @needs_osmesa
-def test_auto_falls_back_on_osmesa_and_says_so(without_egl):
-    with pytest.warns(UserWarning, match="egl does not render here .*: osmesa does, its pix"):
+def test_auto_falls_back_on_osmesa_with_a_warning(without_egl):
+    with pytest.warns(UserWarning, match=r"egl .*osmesa"):
         assert rendering.choose("auto") == "osmesa"
 
 
 @needs_osmesa
-def test_osmesa_is_taken_where_it_is_asked_for():
+def test_osmesa_is_taken_if_it_is_asked_for():
     assert rendering.choose("osmesa") == "osmesa"
 
 
 def test_egl_that_does_not_work_names_its_packages(without_egl):
-    with pytest.raises(InvalidInput) as refusal:
+    packages = "apt-get install libegl1 libgl1-mesa-dri libopengl0"
+    with refused("env.renderer", "egl", naming=["Error: ", packages]):
         rendering.choose("egl")
-    message = str(refusal.value)
-    assert message.startswith("env.renderer='egl': egl does not render here (")
-    assert message.endswith("; apt-get install libegl1 libgl1-mesa-dri libopengl0")
-    assert "Error: " in message  # what the library said
-    assert "\n" not in message
 
 
 def test_osmesa_that_does_not_work_names_its_package(without_osmesa):
-    with pytest.raises(InvalidInput) as refusal:
+    with refused("env.renderer", "osmesa", naming=["Error: ", "apt-get install libosmesa6"]):
         rendering.choose("osmesa")
-    message = str(refusal.value)
-    assert message.startswith("env.renderer='osmesa': osmesa does not render here (")
-    assert message.endswith("; apt-get install libosmesa6")
-    assert "Error: " in message
-    assert "\n" not in message
 
 
-def test_auto_names_the_packages_of_both_where_neither_works(without_egl, without_osmesa):
-    with pytest.raises(InvalidInput) as refusal:
+def test_auto_names_the_packages_of_both_if_neither_works(without_egl, without_osmesa):
+    packages = "libegl1 libgl1-mesa-dri libopengl0, or apt-get install libosmesa6"
+    with refused("env.renderer", "auto", naming=["egl ", "osmesa ", packages]):
         rendering.choose("auto")
-    message = str(refusal.value)
-    assert message.startswith("env.renderer='auto': egl does not render here (")
-    assert ", osmesa does not render here (" in message
-    assert "libegl1 libgl1-mesa-dri libopengl0, or apt-get install libosmesa6" in message
-    assert "\n" not in message
 
 
 def test_an_unknown_renderer_is_refused_and_not_tried(monkeypatch):
     monkeypatch.setattr(subprocess, "run", lambda *_, **__: pytest.fail("tried"))
-    with pytest.raises(InvalidInput, match=r"env\.renderer='glfw': use auto, egl or osmesa"):
+    with refused("env.renderer", "glfw", naming=["auto", "egl", "osmesa"]):
         rendering.choose("glfw")
 
 
 def test_a_backend_that_hangs_does_not_work(monkeypatch):
     monkeypatch.setattr(rendering, "PROBE", "import time; time.sleep(60)")
     monkeypatch.setattr(rendering, "PROBE_SECONDS", 0.2)
-    assert rendering.fault("egl") == "no frame within 0.2 s"
+    assert "0.2 s" in rendering.fault("egl")
 
 
-def test_a_backend_that_crashes_without_a_word_does_not_work(monkeypatch):
+def test_a_backend_that_crashes_without_output_does_not_work(monkeypatch):
     monkeypatch.setattr(rendering, "PROBE", "import os; os.abort()")
-    assert rendering.fault("egl") == "exit code -6"
+    assert "-6" in rendering.fault("egl")
 
 
 def test_a_long_reason_is_cut(monkeypatch):
@@ -135,14 +122,14 @@ def test_a_backend_is_tried_once_per_process(monkeypatch):
     assert rendering.choose("egl") == "egl"
 
 
-def test_trying_a_backend_leaves_this_process_alone():
+def test_trying_a_backend_does_not_change_this_process():
     before = dict(os.environ), set(sys.modules)
     rendering.fault("egl")
     assert (dict(os.environ), set(sys.modules)) == before
 
 
 @needs_egl
-def test_a_process_renders_with_what_it_uses_whatever_the_environment_said():
+def test_use_overrides_the_environment_variables():
     script = """
 from vawm.envs.host import rendering
 rendering.use("egl")
@@ -167,10 +154,12 @@ except Exception as error:
 
 def test_a_process_that_loaded_dm_control_for_physics_is_refused():
     said = in_a_process(f"from dm_control import mujoco\n{REFUSED}", MUJOCO_GL="disable")
-    assert "this process has loaded 'off' already" in said
+    assert "env.renderer='osmesa'" in said
+    assert "'off'" in said
 
 
 @needs_egl
 def test_a_process_that_loaded_mujoco_with_another_backend_is_refused():
     said = in_a_process(f"import mujoco\n{REFUSED}", MUJOCO_GL="egl", PYOPENGL_PLATFORM="egl")
-    assert "this process has loaded 'egl' already" in said
+    assert "env.renderer='osmesa'" in said
+    assert "'egl'" in said

@@ -1,7 +1,7 @@
 """Tasks from pixels: dm_control's own frames, rewards and ends, and equal episodes.
 
-All that renders does so in one process, this file run as a script, for other tests run in
-processes that are to load no backend. It records what it sees; the tests compare.
+One process does all the rendering: it runs this file as a script, because processes that run
+other tests must not load a backend. It records what it sees; the tests compare.
 """
 
 import ctypes.util
@@ -54,7 +54,7 @@ def simulator(task: str, **choices) -> VisionSimulator:
 
 
 def dm_control(task: str, seed: int):
-    """The task as dm_control has it, and the range of its actions."""
+    """The task in dm_control, and the range of its actions."""
     from dm_control import suite
 
     domain, name = next(pair for pair in suite.ALL_TASKS if "_".join(pair) == task)
@@ -67,7 +67,7 @@ def actions(size: int, count: int, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).uniform(-1.5, 1.5, (count, size)).astype(np.float32)
 
 
-# What is recorded -------------------------------------------------------------------------
+# Recording --------------------------------------------------------------------------------
 
 
 def pictures(renderer: str, views=VIEWS) -> dict:
@@ -141,7 +141,7 @@ def episode(sim: VisionSimulator) -> dict:
 
 
 def state(sim: VisionSimulator) -> np.ndarray:
-    """All that the next step depends on, the solver's warm start and the targets among it."""
+    """Everything that the next step depends on, including the warm start and the targets."""
     import mujoco
 
     physics = sim._env.physics
@@ -204,7 +204,7 @@ def endings() -> dict:
 
 
 def controls() -> dict:
-    """What reaches the actuators of quadruped, whose ranges differ."""
+    """The controls of quadruped's actuators, which have different ranges."""
     sim = simulator("quadruped_walk", fast_rendering=True)
     sim.reset(0)
     reached = {}
@@ -217,7 +217,7 @@ def controls() -> dict:
 
 
 def neighbours() -> dict:
-    """A simulator alone, and beside others of its process that come, step and go."""
+    """A simulator alone, and next to others in its process that come and go."""
 
     def play(sim, others=()):
         frames = [sim.reset(2)]
@@ -239,7 +239,7 @@ def neighbours() -> dict:
 
 
 def conduct() -> dict:
-    """How many frames a step draws, what a simulator says of itself, what `close` frees."""
+    """The number of frames per step, a simulator's attributes, and what `close` frees."""
     sim = simulator("walker_walk", action_repeat=10)
     frame = sim.reset(0)
     kept, drawn = frame.copy(), []
@@ -279,7 +279,7 @@ def refusals() -> dict:
 
 
 def flat(recorded: dict, prefix: str = "") -> dict:
-    """Nested dicts as one, with keys such as "pictures/walker_walk 64 True/seen"."""
+    """Flattens nested dicts, to keys such as "pictures/walker_walk 64 True/seen"."""
     entries = {}
     for key, value in recorded.items():
         if isinstance(value, dict):
@@ -305,7 +305,7 @@ def main(path: str, renderer: str) -> None:
     np.savez(path, **flat(recorded))
 
 
-# What is compared -------------------------------------------------------------------------
+# Comparing --------------------------------------------------------------------------------
 
 
 def record(folder: pathlib.Path, renderer: str) -> dict[str, np.ndarray]:
@@ -337,8 +337,8 @@ VIEW_NAMES = [f"{task} {size}" for task, _, _, size in VIEWS]
 def test_frames_are_those_of_dm_control(recorded, view, fast):
     seen, by_hand = (recorded[f"pictures/{view} {fast}/{who}"] for who in ("seen", "by hand"))
     np.testing.assert_array_equal(seen, by_hand)
-    assert seen.std() > 5  # there is something to see
-    assert (seen[0] != seen[-1]).any()  # that moves
+    assert seen.std() > 5  # not a blank picture
+    assert (seen[0] != seen[-1]).any()  # something moves
 
 
 @pytest.mark.parametrize("view", VIEW_NAMES)
@@ -379,7 +379,7 @@ def test_rewards_and_ends_are_those_of_dm_control(recorded, task, repeat, length
     np.testing.assert_array_equal(recorded[f"{name}/seen"], recorded[f"{name}/plain"])
     reward, is_last, is_terminal = recorded[f"{name}/seen"].T
     assert is_last.tolist() == [False] * (length - 1) + [True]
-    assert not is_terminal.any()  # a time limit does not end the return
+    assert not is_terminal.any()  # a time limit is no termination
     assert np.isfinite(reward).all()
 
 
@@ -422,7 +422,7 @@ def test_a_repeat_draws_one_frame(recorded):
     assert recorded["conduct/drawn"] == 1
 
 
-def test_a_simulator_is_what_it_says(recorded):
+def test_a_simulators_attributes_are_true(recorded):
     assert recorded["conduct/obs"].tolist() == [64, 64, 3, True]
     assert recorded["conduct/frame"].tolist() == [64, 64, 3, True, True]
     assert recorded["conduct/action_size"] == 6
@@ -441,7 +441,8 @@ def test_closing_frees_the_context(recorded):
 def test_a_camera_that_is_not_there_is_refused(recorded):
     for camera, name in ((2, "camera"), (-2, "negative")):
         message = str(recorded[f"refusals/{name}"])
-        assert message.startswith(f"env.camera={camera}: walker has cameras 0 to 1;")
+        assert message.startswith(f"env.camera={camera}: ")
+        assert "0 to 1" in message
 
 
 def test_a_second_renderer_in_a_process_is_refused(recorded):
@@ -461,18 +462,20 @@ def test_the_tasks_are_those_of_the_suite():
 
 
 @pytest.mark.parametrize(
-    ("task", "choices", "message"),
+    ("task", "choices", "field", "value", "named"),
     [
-        ("walker_wlak", {}, "task='walker_wlak': did you mean 'walker_walk'?"),
-        ("humanoid_run", {}, "choose one of acrobot_swingup, .*quadruped_run"),
-        ("walker_walk", {"image_size": 0}, r"env\.image_size=0: "),
-        ("walker_walk", {"action_repeat": 0}, "action_repeat=0: "),
-        ("walker_walk", {"renderer": "glfw"}, r"env\.renderer='glfw': use auto, egl or osmesa"),
+        ("walker_wlak", {}, "task", "walker_wlak", "'walker_walk'"),
+        ("humanoid_run", {}, "task", "humanoid_run", ["acrobot_swingup", "quadruped_run"]),
+        ("walker_walk", {"image_size": 0}, "env.image_size", 0, ()),
+        ("walker_walk", {"action_repeat": 0}, "action_repeat", 0, ()),
+        ("walker_walk", {"renderer": "glfw"}, "env.renderer", "glfw", ["egl", "osmesa"]),
     ],
 )
-def test_bad_choices_are_refused_before_anything_is_loaded(task, choices, message):
+def test_bad_choices_are_refused_before_anything_is_loaded(task, choices, field, value, named):
+    from refusals import refused  # not known where this file runs as a script
+
     loaded = set(sys.modules)
-    with pytest.raises(InvalidInput, match=message):
+    with refused(field, value, naming=named):
         simulator(task, **choices)
     assert set(sys.modules) == loaded
 

@@ -25,7 +25,7 @@ def control_step(model, blank, state, ctrl, *, substeps):
 
 
 def state_of(seen):
-    """Where the steps of `seen` begin, as fields of MJX's data."""
+    """The start states of `seen`, as fields of MJX's data."""
     return {
         "qpos": seen.qpos.astype(np.float32),
         "qvel": seen.qvel.astype(np.float32),
@@ -99,7 +99,7 @@ def test_the_compared_states_cover_reward(name):
 
 
 @pytest.mark.parametrize("name", ["finger_spin", "hopper_hop"])
-def test_touch_is_compared_where_it_is_felt(name):
+def test_the_compared_states_cover_touch(name):
     seen, _, obs, _ = compare(name)
     touch = seen.obs[:, 7:9] if name == "finger_spin" else seen.obs[:, -2:]
     actual = obs[:, 7:9] if name == "finger_spin" else obs[:, -2:]
@@ -124,7 +124,7 @@ def test_fewer_solver_iterations_leave_the_step_unchanged(domain):
 
 @pytest.mark.parametrize("domain", sorted({split(name)[0] for name in TASKS}))
 def test_tasks_of_a_domain_share_one_compiled_step(domain):
-    """All that compilation depends on, besides shapes of states, is the same."""
+    """Everything that compilation depends on, apart from the shapes of states, is equal."""
     loaded = [environment.load(*split(name)) for name in TASKS if split(name)[0] == domain]
     kinds = [jax.tree.flatten((physics.model, physics.blank)) for _, physics in loaded]
     for leaves, structure in kinds:

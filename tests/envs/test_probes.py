@@ -30,14 +30,14 @@ def test_known_values_are_the_discounted_returns_of_the_best_policy(name):
     reward = np.asarray(timestep.reward, float)
     for t in range(T):
         returns = sum(DISCOUNT**k * reward[t + 1 + k] for k in range(T - t))
-        if name == "truncation":  # a cut bootstraps: the rest is as good again
+        if name == "truncation":  # truncation bootstraps: the value continues
             returns += DISCOUNT ** (T - t) / (1 - DISCOUNT)
         expected = probes.known_value(
             name, steps=steps[t], signal=signal[t], discount=DISCOUNT, episode_length=T
         )
         if name == "observation_reward":
             returns = [returns[signal[t] == s].mean() for s in (-1, 1)]
-            np.testing.assert_allclose(returns, [-1, 1], atol=0.6)  # noise of the steps to come
+            np.testing.assert_allclose(returns, [-1, 1], atol=0.6)  # noise of later steps
             np.testing.assert_array_equal(expected, signal[t])
             np.testing.assert_array_equal(reward[t + 1], signal[t])
         else:

@@ -36,7 +36,7 @@ def reference_starts(name):
 
 @pytest.mark.parametrize("name", TASKS)
 def test_initial_states_are_distributed_as_in_dm_control(name):
-    """Every coordinate of qpos, qvel and target, by Kolmogorov and Smirnov.
+    """Kolmogorov-Smirnov test of every coordinate of qpos, qvel and target.
 
     Under equality one p-value in a thousand falls below the bound; about 120 are computed.
     """

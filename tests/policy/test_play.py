@@ -1,14 +1,14 @@
-"""Playing on the host: every episode that is to count does, once, whatever its length."""
+"""Playing on the host: the planned episodes count exactly once, whatever their length."""
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import tiny_pixels
+from refusals import refused
 
 from vawm import evaluate
 from vawm.envs.host.pool import Pool, episode_seed
 from vawm.envs.host.simulator import Outcome
-from vawm.errors import InvalidInput
 from vawm.policy import Policy, play
 from vawm.types import vector
 
@@ -16,7 +16,7 @@ SEED = 5
 
 
 class Uneven:
-    """Episodes of 1 to 9 steps by their seed; the reward of all steps is 1."""
+    """Episodes of 1 to 9 steps, depending on the seed; every reward is 1 + the action."""
 
     obs = vector(1)
     action_size = 1
@@ -41,7 +41,7 @@ def length_of(seed):
 
 
 def policy(spec, action=0.0, seen=None):
-    """Always the same action; notes how it is asked."""
+    """A policy with a constant action; records `how` it is asked."""
 
     def apply(params, state, key, carry, timestep, how):
         if seen is not None:
@@ -58,7 +58,7 @@ def env(request):
 
 
 @pytest.mark.parametrize("episodes", [1, 3, 7])
-def test_which_episodes_count_is_fixed_before_they_are_played(env, episodes):
+def test_the_episodes_that_count_are_fixed_in_advance(env, episodes):
     num_envs = env.spec.num_envs
     score = evaluate.evaluate(policy(env.spec), episodes=episodes, env=env, seed=SEED)
     expected = [
@@ -77,7 +77,7 @@ def test_no_episode_of_training_is_played():
 
 
 def test_short_episodes_are_not_favoured():
-    """Of 8 environments the first 8 to finish would be short ones, often two of the same."""
+    """The first 8 episodes to finish in 8 environments would be short ones."""
     with Pool(Uneven, task="uneven", num_envs=8, workers=1) as env:
         scores = [
             play.on_host(env, policy(env.spec), episodes=8, seed=seed) for seed in range(40)
@@ -90,7 +90,7 @@ def test_short_episodes_are_not_favoured():
     assert np.mean(counted) == pytest.approx(5.0, abs=0.5)  # of lengths 1 to 9
 
 
-def test_rewards_are_those_of_the_policy_s_actions(env):
+def test_returns_follow_from_the_actions_of_the_policy(env):
     score = play.on_host(env, policy(env.spec, action=0.5), episodes=3, seed=SEED)
     still = play.on_host(env, policy(env.spec), episodes=3, seed=SEED)
     np.testing.assert_allclose(score.returns, 1.5 * np.array(still.returns))
@@ -104,9 +104,9 @@ def test_the_policy_is_asked_to_sample_or_for_its_mode(env):
 
 
 def test_impossible_numbers_are_refused(env):
-    with pytest.raises(InvalidInput, match="episodes=0"):
+    with refused("episodes", 0):
         evaluate.evaluate(policy(env.spec), episodes=0, env=env)
-    with pytest.raises(InvalidInput, match="seed=-1"):
+    with refused("seed", -1):
         evaluate.evaluate(policy(env.spec), episodes=1, env=env, seed=-1)
 
 
@@ -120,4 +120,6 @@ def test_options_of_another_suite_are_refused(tmp_path, monkeypatch, capsys):
     ]:
         argv = ["--logdir", str(tmp_path), *flags]
         assert evaluate.guard(lambda argv=argv: evaluate.main(argv)) == 2
-        assert capsys.readouterr().err.startswith(f"error: {message}")
+        told = capsys.readouterr().err
+        assert told.startswith(f"error: {message}")
+        assert told.count("\n") == 1

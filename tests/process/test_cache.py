@@ -1,4 +1,4 @@
-"""Where the compilation cache is."""
+"""The folder of the compilation cache."""
 
 import pathlib
 
@@ -9,7 +9,7 @@ from vawm.process import cache
 
 
 @pytest.fixture(autouse=True)
-def settings_of_before():
+def restore_jax_settings():
     names = (
         "jax_compilation_cache_dir",
         "jax_enable_compilation_cache",

@@ -1,4 +1,4 @@
-"""The restart with huge pages, in processes of its own."""
+"""The restart with huge pages, each in its own process."""
 
 import os
 import subprocess
@@ -10,7 +10,7 @@ from vawm.process import huge_pages
 
 PROGRAM = """
 import os, sys
-from vawm.huge_pages import use_huge_pages
+from vawm.process.huge_pages import use_huge_pages
 use_huge_pages()
 print(os.environ.get("GLIBC_TUNABLES"), sys.argv[1:])
 """
@@ -60,6 +60,6 @@ def test_it_can_be_turned_off(tmp_path):
     assert run(tmp_path, VAWM_HUGE_PAGES="0") == "None ['--flag', 'a b']\n"
 
 
-def test_a_setting_of_the_user_is_left_alone(tmp_path):
+def test_the_users_own_malloc_setting_is_kept(tmp_path):
     out = run(tmp_path, GLIBC_TUNABLES="glibc.malloc.hugetlb=0")
     assert out.startswith("glibc.malloc.hugetlb=0 ")

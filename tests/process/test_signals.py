@@ -1,4 +1,4 @@
-"""The first signal asks, the second ends, even inside a long call."""
+"""The first signal asks a run to stop, the second kills it, even inside a long call."""
 
 import os
 import signal
@@ -13,7 +13,7 @@ from vawm.process import signals
 
 SCRIPT = """
 import ctypes, sys
-from vawm import signals
+from vawm.process import signals
 with signals.catch(lambda: print("asked", flush=True)) as stop:
     print("ready", flush=True)
     libc = ctypes.CDLL(None)
@@ -47,7 +47,7 @@ def test_signals_end_a_process_with_the_code_that_shells_expect(number, code, ti
     process.stdout.close()
 
 
-def test_the_handlers_of_before_come_back():
+def test_the_earlier_handlers_are_restored():
     before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
     heard = threading.Event()
     with signals.catch(heard.set) as stop:
@@ -59,7 +59,7 @@ def test_the_handlers_of_before_come_back():
 
 
 def test_sighup_stays_ignored_and_sigint_does_not():
-    """The one is ignored under `nohup`, the other in what a script starts with `&`."""
+    """`nohup` ignores SIGHUP; scripts ignore SIGINT for what they start with `&`."""
     numbers = signal.SIGHUP, signal.SIGINT
     before = [signal.signal(number, signal.SIG_IGN) for number in numbers]
     try:
@@ -74,7 +74,7 @@ def test_sighup_stays_ignored_and_sigint_does_not():
             signal.signal(number, handler)
 
 
-def test_a_notice_that_nobody_can_read_does_not_end_the_listening():
+def test_a_notice_that_cannot_be_printed_does_not_stop_the_listener():
     def notice():
         raise ValueError("the terminal is closed")
 

@@ -10,9 +10,9 @@ import runs
 import tiny
 import tiny_storm
 
-from vawm import config as config_lib
 from vawm import evaluate, presets
 from vawm.agent import registry
+from vawm.config import LaPropConfig, ReplayConfig, ValueAlignmentConfig
 from vawm.envs.host import rendering
 from vawm.policy import policy
 from vawm.runs import runner, suites
@@ -36,9 +36,9 @@ def tiny_version(config, steps=STEPS, **changes):
         actor=tiny.CONFIG.actor,
         critic=tiny.CONFIG.critic,
         imagination=tiny.CONFIG.imagination,
-        value_alignment=config_lib.ValueAlignmentConfig(warmup_steps=steps // 2),
-        optimizer=config_lib.LaPropConfig(learning_rate=1e-3, warmup_updates=10),
-        replay=config_lib.ReplayConfig(capacity=steps, batch_size=4, batch_length=16),
+        value_alignment=ValueAlignmentConfig(warmup_steps=steps // 2),
+        optimizer=LaPropConfig(learning_rate=1e-3, warmup_updates=10),
+        replay=ReplayConfig(capacity=steps, batch_size=4, batch_length=16),
         video=dataclasses.replace(config.video, every=frames // 2, sequences=2),
         **changes,
     )
@@ -72,10 +72,7 @@ def run(request, tmp_path_factory):
     console = runs.quiet()
     runner.run(config, logdir, console=console, command="python train.py")
     assert f"python -m vawm.evaluate --logdir {logdir}" in console.file.getvalue()
-    assert (
-        f"go on with: python train.py --resume --logdir {logdir} --env"
-        in console.file.getvalue()
-    )
+    assert f"python train.py --resume --logdir {logdir} --env" in console.file.getvalue()
     return logdir, config
 
 

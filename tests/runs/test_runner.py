@@ -17,6 +17,7 @@ import pytest
 import rich.console
 import tiny
 import toy
+from refusals import refused
 from runs import assert_same, events, files_of, lines, measured, quiet
 from tensorboardX.proto.event_pb2 import SessionLog
 
@@ -28,7 +29,7 @@ from vawm.runs import budget, checkpoint, diagnosis, runner
 from vawm.runs.checkpoint import manifest
 from vawm.runs.reports import backends, tracking
 from vawm.runs.runner import RunError
-from vawm.runs.trainer import CompiledStep, Program
+from vawm.runs.trainer import CompiledStep, Trainer
 from vawm.types import TimeStep, Trajectory
 
 LONG = tiny.config(env_steps=192)
@@ -68,13 +69,13 @@ class FakeStep:
 
 
 class Waiting(NamedTuple):
-    """What has arrived, in place of a `Collector`."""
+    """A time step that waits to be stored; replaces a `Collector`."""
 
     timestep: TimeStep
 
 
 def arrived(reward=(0.0, 0.0)):
-    """Of two environments, with these rewards."""
+    """The time steps of two environments, with these rewards."""
     flag = jnp.zeros(2, bool)
     return Waiting(TimeStep(jnp.zeros((2, 1)), jnp.array(reward), flag, flag, flag))
 
@@ -85,7 +86,7 @@ def stored(reward=()):
     example = Trajectory(zeros[:, None], zeros, zeros > 0, zeros > 0, zeros > 0, zeros[:, None])
     buffer = replay.init(example, (), capacity=4)
     steps = jax.tree.map(lambda x: jnp.stack([x] * 4, 1), example)
-    buffer = replay.add(buffer, steps, ())  # and wraps with what follows
+    buffer = replay.add(buffer, steps, ())  # full, so the next steps overwrite the oldest
     reward = jnp.asarray(reward or jnp.zeros((2, 0)), jnp.float32)
     steps = jax.tree.map(lambda x: x[:, : reward.shape[1]], steps)
     return replay.add(buffer, steps._replace(reward=reward), ())
@@ -93,10 +94,10 @@ def stored(reward=()):
 
 @pytest.fixture
 def fake(monkeypatch):
-    """Puts a `FakeStep` with the given losses in place of training."""
+    """Replaces training by a `FakeStep` with the given losses."""
 
     def install(loss=lambda env_steps: env_steps):
-        program = Program(
+        trainer = Trainer(
             spec=toy.SPEC,
             agent=None,
             shapes=None,
@@ -106,7 +107,7 @@ def fake(monkeypatch):
             resume=lambda state, _: (state, 0),
             close=lambda: None,
         )
-        monkeypatch.setattr(runner, "prepare", lambda *_: program)
+        monkeypatch.setattr(runner, "prepare", lambda *_: trainer)
 
     return install
 
@@ -131,12 +132,10 @@ def test_a_run_leaves_its_config_a_checkpoint_and_advice(tmp_path, fake):
     assert result == runner.Result(tmp_path, 96, 0)
     assert json.loads((tmp_path / "config.json").read_text())["config"]["env_steps"] == 96
     assert checkpoint.latest(tmp_path).name == "000000000096"
-    # What to do where the environment is no registered one.
+    # The advice for an environment that is not registered.
     assert f"vawm.evaluate.evaluate(vawm.load({str(tmp_path)!r})" in console.file.getvalue()
-    resumption = (
-        f"vawm.runs.runner.run(config, {str(tmp_path)!r}, env=..., resume=True), its env_st"
-    )
-    assert f"go on with: {resumption}" in console.file.getvalue()
+    resumption = f"vawm.runs.runner.run(config, {str(tmp_path)!r}, env=..., resume=True)"
+    assert resumption in console.file.getvalue()
 
 
 def test_a_tracker_that_fails_changes_nothing_but_one_line_of_output(
@@ -151,7 +150,9 @@ def test_a_tracker_that_fails_changes_nothing_but_one_line_of_output(
     console = quiet()
     run(tiny.config(tracker="wandb"), tmp_path / "with", console=console)
     run(tiny.CONFIG, tmp_path / "without")
-    assert console.file.getvalue().count("warning: wandb gets no more") == 1
+    warnings = [text for text in console.file.getvalue().splitlines() if "warning" in text]
+    assert len(warnings) == 1
+    assert "wandb" in warnings[0]
     assert measured(tmp_path / "with") == measured(tmp_path / "without")
     assert checkpoint.latest(tmp_path / "with").name == "000000000096"
 
@@ -160,7 +161,7 @@ def saves(logdir):
     return [line["env_steps"] for line in tracking.read(logdir / tracking.SAVE_LINES)]
 
 
-def test_a_line_tells_of_each_checkpoint(tmp_path, fake):
+def test_each_checkpoint_has_a_line(tmp_path, fake):
     fake()
     run(tiny.CONFIG, tmp_path)
     names = {"checkpoint/bytes", "checkpoint/seconds", "checkpoint/blocked_seconds"}
@@ -170,7 +171,7 @@ def test_a_line_tells_of_each_checkpoint(tmp_path, fake):
     assert not any("checkpoint/bytes" in line for line in lines(tmp_path))
 
 
-def test_checkpoints_by_time_change_nothing_that_is_measured(tmp_path, fake):
+def test_checkpoints_by_time_do_not_change_the_metrics(tmp_path, fake):
     fake()
     for name, minutes in (("often", 1e-9), ("never", 0.0)):
         config = tiny.config(save_minutes=minutes, save_every=1000, env_steps=48)
@@ -183,7 +184,7 @@ def test_checkpoints_by_time_change_nothing_that_is_measured(tmp_path, fake):
 
 
 def test_a_chunk_without_a_step_forward_is_not_saved_again(tmp_path, fake, monkeypatch):
-    """As where every environment is reset; one that goes back is an error."""
+    """As when every environment is reset. A decrease is an error."""
     steps = iter([8, 8, 16, 8])
     fake()
     advance = runner.advance
@@ -194,7 +195,7 @@ def test_a_chunk_without_a_step_forward_is_not_saved_again(tmp_path, fake, monke
             progress, metrics | {"env_steps": next(steps)}, began=began
         ),
     )
-    with pytest.raises(RunError, match="env_steps went from 16 back to 8"):
+    with pytest.raises(RunError, match=r"env_steps.* 16 .* 8"):
         run(tiny.config(save_minutes=1e-9), tmp_path)
     assert saves(tmp_path) == [8, 16]
 
@@ -220,7 +221,7 @@ def test_a_disk_that_is_full_when_saving_ends_the_run_and_keeps_the_checkpoint(
     assert checkpoint.find(tmp_path).manifest.env_steps == 32
 
 
-def test_starting_over_on_purpose_moves_what_is_there_aside(tmp_path, fake):
+def test_starting_over_moves_the_old_files_to_a_subfolder(tmp_path, fake):
     fake()
     run(tiny.CONFIG, tmp_path / "run", fresh=True)
     for number in (1, 2):
@@ -229,11 +230,11 @@ def test_starting_over_on_purpose_moves_what_is_there_aside(tmp_path, fake):
         config = tiny.config(seed=number, env_steps=48 + 8 * number)
         run(config, tmp_path / "run", fresh=True, console=console)
         aside = tmp_path / "run" / f"replaced-{number}"
-        assert f"is in {aside} now: this run starts over" in console.file.getvalue()
+        assert str(aside) in console.file.getvalue()
         assert measured(aside) == before
         assert checkpoint.find(aside).manifest.config.seed == number - 1
         assert checkpoint.find(tmp_path / "run").manifest.config.seed == number
-    with pytest.raises(InvalidInput, match="fresh=True: starts over, and --resume goes on"):
+    with refused("fresh", True, naming="--resume"):
         run(tiny.CONFIG, tmp_path / "run", fresh=True, resume=True)
 
 
@@ -242,7 +243,7 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_checkpoint(
     tmp_path, fake, value
 ):
     fake(lambda env_steps: value if env_steps > 40 else 1.0)
-    with pytest.raises(runner.RunError, match=r"loss/critic is .* at env_steps=48.* at 32"):
+    with pytest.raises(runner.RunError, match=r"loss/critic .*env_steps=48.* at 32"):
         run(tiny.CONFIG, tmp_path)
     assert checkpoint.latest(tmp_path).name == "000000000032"
     assert lines(tmp_path)[-1]["loss/critic"] is None
@@ -261,8 +262,8 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_checkpoint(
     }
 
 
-def test_a_parameter_that_the_last_update_broke_is_told_as_well(tmp_path, fake, monkeypatch):
-    """Its loss is that of the parameters before; one of the update after it never comes."""
+def test_a_parameter_broken_by_the_last_update_stops_the_run_too(tmp_path, fake, monkeypatch):
+    """The loss of that update is finite, and there is no later one."""
     call = FakeStep.__call__
 
     def breaks(self, state):
@@ -276,8 +277,8 @@ def test_a_parameter_that_the_last_update_broke_is_told_as_well(tmp_path, fake, 
 
     fake()
     monkeypatch.setattr(FakeStep, "__call__", breaks)
-    told = r"parameter \.actor\['bias'\] is not finite at env_steps=96; kept: .* at 64.*"
-    with pytest.raises(RunError, match=told + "more in .*diagnosis.json"):
+    told = r"\.actor\['bias'\].*env_steps=96.* at 64.*diagnosis.json"
+    with pytest.raises(RunError, match=told):
         run(tiny.CONFIG, tmp_path)
     found = json.loads((tmp_path / "diagnosis.json").read_text())
     assert found["nonfinite_parameters"] == [".actor['bias']"]
@@ -285,7 +286,7 @@ def test_a_parameter_that_the_last_update_broke_is_told_as_well(tmp_path, fake, 
     assert lines(tmp_path)[-1]["env_steps"] == 96
 
 
-def test_a_loss_that_is_not_finite_is_told_though_a_save_has_failed(
+def test_a_loss_that_is_not_finite_is_reported_even_if_a_save_failed(
     tmp_path, fake, monkeypatch
 ):
     def full(*_):
@@ -294,17 +295,17 @@ def test_a_loss_that_is_not_finite_is_told_though_a_save_has_failed(
     def loss(env_steps):
         if env_steps < 40:
             return 1.0
-        time.sleep(0.3)  # for the save at 32
+        time.sleep(0.3)  # until the save at 32 has failed
         return math.nan
 
     fake(loss)
     monkeypatch.setattr(manifest, "write", full)
-    with pytest.raises(RunError, match=r"loss/critic is nan at env_steps=40; kept: no check"):
+    with pytest.raises(RunError, match=r"loss/critic is nan .*env_steps=40.*no checkpoint"):
         run(tiny.CONFIG, tmp_path)
     assert (tmp_path / "diagnosis.json").exists()
 
 
-def test_what_replay_holds_that_is_not_finite_is_named_by_environment_and_step():
+def test_replayed_steps_that_are_not_finite_are_named_by_environment_and_step():
     nan, inf = math.nan, math.inf
     replay_of_both = stored([[1.0, nan, 2.0], [-inf, 0.0, nan]])
     state = toy.state()._replace(replay=replay_of_both, collector=arrived())
@@ -314,7 +315,7 @@ def test_what_replay_holds_that_is_not_finite_is_named_by_environment_and_step()
     assert not diagnosis.nonfinite_steps(state._replace(replay=stored([[1e30], [-1e30]])))
 
 
-def test_what_has_arrived_and_is_not_stored_yet_comes_after_what_is():
+def test_a_step_that_is_not_stored_yet_comes_after_those_in_replay():
     state = toy.state()._replace(replay=stored([[1.0], [math.nan]]), collector=arrived())
     before = {"field": "reward", "environment": 1, "steps_ago": 0, "steps": 1}
     assert diagnosis.nonfinite_steps(state) == [before]
@@ -323,34 +324,39 @@ def test_what_has_arrived_and_is_not_stored_yet_comes_after_what_is():
     assert diagnosis.nonfinite_steps(state) == [before, now]
 
 
-def test_who_returned_it_is_not_blamed_on_the_environment_where_an_action_came_before():
+def test_an_environment_is_not_blamed_if_an_earlier_action_was_not_finite():
     nan = math.nan
     replay_of_both = stored([[1.0, 1.0], [1.0, nan]])
     blamed = toy.state()._replace(replay=replay_of_both, collector=arrived())
-    assert diagnosis.advice(blamed).startswith("environment 1 returned reward that is")
+    assert blames_environment(diagnosis.advice(blamed))
     actions = blamed.replay.trajectory.action
     same, before = (actions.at[1, slot].set(nan) for slot in newest(blamed.replay, 0, 1))
-    for action, told in (
-        (same, "environment 1 returned"),
-        (before, "Start again with a small"),
-    ):
+    for action, environment in ((same, True), (before, False)):
         trajectory = blamed.replay.trajectory._replace(action=action)
         state = blamed._replace(replay=blamed.replay._replace(trajectory=trajectory))
-        assert diagnosis.advice(state).startswith(told)
+        assert blames_environment(diagnosis.advice(state)) == environment
         reason = diagnosis.reason(state, {"chunk/nonfinite": 1}, last=False)
-        assert reason.startswith("an action" if told.startswith("Start") else "what an env")
+        assert ("an environment" in reason) == environment
+        assert ("action" in reason) != environment
     whole = toy.state()._replace(replay=stored(), collector=arrived())
     reason = diagnosis.reason(whole, {"chunk/nonfinite": 1}, last=False)
-    assert reason.startswith("what an env")  # and was overwritten since
+    assert "an environment" in reason  # the step has been overwritten
+
+
+def blames_environment(advice):
+    """Whether advice names the reward of environment 1, and not the learning rate."""
+    named = "reward" in advice and "environment 1" in advice
+    assert named != ("--optimizer.learning-rate" in advice)
+    return named
 
 
 def newest(buffer, *ago):
-    """The slots of steps counted back from the newest."""
+    """The slots of these steps, counted back from the newest."""
     return [(int(buffer.head) - 1 - a) % buffer.trajectory.reward.shape[1] for a in ago]
 
 
 @pytest.mark.parametrize("field", ["reward", "obs"])
-def test_a_first_observation_that_is_not_finite_begins_no_run(tmp_path, field):
+def test_a_first_observation_that_is_not_finite_stops_the_run(tmp_path, field):
     plain = tiny.env()
 
     def reset(key):
@@ -358,16 +364,13 @@ def test_a_first_observation_that_is_not_finite_begins_no_run(tmp_path, field):
         value = getattr(timestep, field).at[1].set(jnp.nan)
         return state, timestep._replace(**{field: value})
 
-    told = f"environment 1 returned {field} that is not finite where the run begins: mend that"
-    with pytest.raises(RunError, match=told):
+    with pytest.raises(RunError, match=f"{field}.*environment 1.*first reset"):
         run(tiny.CONFIG, tmp_path, env=plain._replace(reset=reset))
     assert checkpoint.latest(tmp_path) is None
 
 
-def test_a_nan_action_that_an_environment_puts_up_with_is_not_saved_either(
-    tmp_path, monkeypatch
-):
-    """That is the policy's fault, and the line says so."""
+def test_a_nan_action_stops_the_run_even_if_the_environment_accepts_it(tmp_path, monkeypatch):
+    """The message blames the policy."""
     act = Agent.act
 
     def wild(*args, **kwargs):
@@ -378,13 +381,13 @@ def test_a_nan_action_that_an_environment_puts_up_with_is_not_saved_either(
     monkeypatch.setattr(Agent, "act", wild)
     plain = tiny.env()
     tolerant = plain._replace(step=lambda state, a: plain.step(state, jnp.nan_to_num(a)))
-    with pytest.raises(RunError, match=r"an action is not finite at .* Start again with a"):
+    with pytest.raises(RunError, match=r"action .*--optimizer\.learning-rate"):
         run(tiny.CONFIG, tmp_path, env=tolerant)
     assert checkpoint.latest(tmp_path) is None
 
 
 class Counted(NamedTuple):
-    """The state of an environment, and how often it was stepped."""
+    """The state of an environment, and the number of calls of `step`."""
 
     inner: Any
     steps: jax.Array
@@ -393,7 +396,7 @@ class Counted(NamedTuple):
 
 
 def breaking(field, at):
-    """The environment of `tiny`; its second one returns one NaN, by call `at`."""
+    """The environments of `tiny`; the second one returns one NaN, at call `at`."""
     plain = tiny.env()
 
     def counted(state, calls):
@@ -415,30 +418,29 @@ def breaking(field, at):
 
 @pytest.mark.parametrize(("field", "ago"), [("reward", 2), ("obs", 2), ("obs", 0)])
 def test_one_step_that_is_not_finite_stops_the_run_before_it_is_saved(tmp_path, field, ago):
-    """Of an environment of one's own on the device. Mended, the run goes on."""
+    """In a user's environment on the device. After a fix, the run can be resumed."""
     told = (
-        "what an environment returned is not finite at env_steps=40; kept: the checkpoint at "
-        rf"32; .*json. environment 1 returned {field} that is not finite, {ago} steps before "
-        "the newest: mend what returned it, then go on with --resume"
+        rf"environment.*env_steps=40.* at 32.*diagnosis\.json.*{field}.*environment 1.*"
+        rf"{ago} steps before.*--resume"
     )
     with pytest.raises(RunError, match=told):  # after the 24 calls of six chunks
         run(tiny.CONFIG, tmp_path, env=breaking(field, at=24 - ago))
     diagnosed = json.loads((tmp_path / "diagnosis.json").read_text())
-    assert diagnosed["nonfinite_replay"][0]["field"] == field  # the action that followed, too
+    assert diagnosed["nonfinite_replay"][0]["field"] == field  # before the action that follows
     assert not diagnosed["nonfinite_parameters"]
-    mended = run(tiny.CONFIG, tmp_path, env=breaking(field, at=-1), resume=True)
-    assert mended.env_steps == tiny.CONFIG.env_steps
+    fixed = run(tiny.CONFIG, tmp_path, env=breaking(field, at=-1), resume=True)
+    assert fixed.env_steps == tiny.CONFIG.env_steps
 
 
 def test_rewards_that_are_nan_in_replay_stop_the_run_and_are_named(tmp_path, monkeypatch):
-    """However they came there: it is the loss that tells."""
+    """However they got there: the loss shows it."""
     prepare, chunks = runner.prepare, []
 
     def poisoned(*arguments):
-        program = prepare(*arguments)
+        trainer = prepare(*arguments)
 
         def compile_step(state):
-            step = program.compile(state).run
+            step = trainer.compile(state).run
 
             def call(state):
                 chunks.append(len(chunks))
@@ -450,14 +452,12 @@ def test_rewards_that_are_nan_in_replay_stop_the_run_and_are_named(tmp_path, mon
 
             return CompiledStep(call, ())
 
-        return program._replace(compile=compile_step)
+        return trainer._replace(compile=compile_step)
 
     monkeypatch.setattr(runner, "prepare", poisoned)
-    with pytest.raises(
-        RunError, match=r"loss/.* is nan at .*; more in .*diagnosis.json"
-    ) as error:
+    with pytest.raises(RunError, match=r"loss/.* is nan .*diagnosis.json") as error:
         run(tiny.CONFIG, tmp_path)
-    assert "environment 1 returned reward that is not finite" in str(error.value)
+    assert re.search("reward .*environment 1", str(error.value))
     found = json.loads((tmp_path / "diagnosis.json").read_text())
     ago = 4 * len(chunks) - 1  # 4 calls in a chunk
     assert found["nonfinite_replay"] == [
@@ -470,27 +470,27 @@ def test_rewards_that_are_nan_in_replay_stop_the_run_and_are_named(tmp_path, mon
 
 def test_a_run_that_was_killed_before_its_first_checkpoint_starts_again(tmp_path, fake):
     fake(lambda env_steps: math.nan if env_steps > 16 else 1.0)
-    with pytest.raises(runner.RunError, match="no checkpoint yet"):
+    with pytest.raises(runner.RunError, match="no checkpoint"):
         run(tiny.CONFIG, tmp_path)
-    with pytest.raises(InvalidInput, match="exists; continue that run with --resume"):
+    with refused("logdir", str(tmp_path), naming="--resume"):
         run(tiny.CONFIG, tmp_path)
     fake()
     console = quiet()
     assert run(tiny.CONFIG, tmp_path, resume=True, console=console).env_steps == 96
-    assert f"no checkpoint in {tmp_path} yet" in console.file.getvalue()
+    assert f"no checkpoint in {tmp_path}" in console.file.getvalue()
     assert [line["env_steps"] for line in lines(tmp_path)] == [16, 32, 48, 64, 80, 96]
     assert len(list(tmp_path.glob("events.out.tfevents.*"))) == 1
 
 
-def test_the_banner_comes_only_once_the_folder_is_claimed(tmp_path, fake, monkeypatch):
+def test_the_banner_is_printed_after_the_folder_is_locked(tmp_path, fake, monkeypatch):
     fake()
     console = quiet()
     run(tiny.CONFIG, tmp_path / "run", console=console, banner="who I am")
     assert console.file.getvalue().startswith("who I am\n")
     console = quiet()
-    monkeypatch.setattr(runner.rundir, "check_new", lambda _: None)
+    monkeypatch.setattr(runner.run_folder, "check_new", lambda _: None)
     (tmp_path / "file").touch()
-    with pytest.raises(InvalidInput, match="is not writable"):
+    with refused("logdir", str(tmp_path / "file" / "run")):
         run(tiny.CONFIG, tmp_path / "file" / "run", console=console, banner="who I am")
     assert not console.file.getvalue()
 
@@ -507,32 +507,30 @@ def test_running_out_of_memory_is_explained(tmp_path, fake, error):
         raise error
 
     fake(exhausted)
-    with pytest.raises(
-        RunError, match=r"memory.* smaller replay.capacity.*\((RES|Una)"
-    ) as told:
+    with pytest.raises(RunError, match=r"memory.*replay\.capacity.*(RES|Una)") as told:
         run(tiny.CONFIG, tmp_path)
     assert "\n" not in str(told.value)
 
 
 @pytest.mark.parametrize(
-    ("changes", "reason"),
+    ("changes", "named"),
     [
         ({"env_steps": "8"}, "env_steps is '8'"),
         ({"seconds": None}, "seconds is None"),
-        ({"interval": {"weighted": []}}, "weighted is \\[\\]"),
+        ({"interval": {"weighted": []}}, "weighted is []"),
         ({"interval": {"more": 1}}, "more"),
-        ({"interval": None}, "counters of a run"),
+        ({"interval": None}, ()),
         ({"more": 1}, "more"),
     ],
 )
-def test_counters_of_another_kind_are_refused(changes, reason):
+def test_counters_of_another_type_are_refused(changes, named):
     saved = runner.Progress()._asdict() | {"interval": {}}
     assert runner._progress(saved) == runner.Progress()
-    with pytest.raises(InvalidInput, match=reason):
+    with refused("checkpoint", "progress", naming=named):
         runner._progress(saved | changes)
 
 
-def test_checkpoints_that_could_not_be_written_are_refused_before_training(
+def test_a_checkpoint_folder_that_is_not_writable_is_refused_before_training(
     tmp_path, fake, monkeypatch
 ):
     fake()
@@ -540,37 +538,41 @@ def test_checkpoints_that_could_not_be_written_are_refused_before_training(
     folder = checkpoint.root(tmp_path)
     access = os.access
     monkeypatch.setattr(os, "access", lambda path, mode: path != folder and access(path, mode))
-    with pytest.raises(InvalidInput, match=r"checkpoints': is not writable"):
+    with refused("logdir", str(folder)):
         run(LONG, tmp_path, resume=True)
 
 
 @pytest.mark.parametrize(
-    "broken", ["tracking.Tracker.write", "rundir.write_config", "tracking.Tracker.__init__"]
+    "broken",
+    [
+        "reports.tracking.Tracker.write",
+        "run_folder.write_config",
+        "reports.tracking.Tracker.__init__",
+    ],
 )
 def test_a_full_disk_is_explained_in_one_line(tmp_path, fake, monkeypatch, broken):
     def full(*_, **__):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     fake()
-    monkeypatch.setattr(f"vawm.{broken}", full)
+    monkeypatch.setattr(f"vawm.runs.{broken}", full)
     with pytest.raises(runner.RunError) as error:
         run(tiny.CONFIG, tmp_path)
-    told = rf"{tmp_path}: No space left on device \([\d.]+ \w+ free\); "
-    assert re.match(told, str(error.value))
+    assert re.search(rf"{tmp_path}.*No space left.*[\d.]+ \w+ free", str(error.value))
     assert "\n" not in str(error.value)
 
 
-def test_a_run_whose_checkpoints_are_gone_keeps_its_metrics(tmp_path, fake):
+def test_a_run_whose_checkpoints_are_missing_keeps_its_metrics(tmp_path, fake):
     fake()
     run(tiny.CONFIG, tmp_path)
     shutil.rmtree(tmp_path / "checkpoints")
     before = measured(tmp_path)
-    with pytest.raises(InvalidInput, match="its checkpoints are gone"):
+    with refused("logdir", str(tmp_path)):
         run(LONG, tmp_path, resume=True)
     assert measured(tmp_path) == before
 
 
-def test_a_signal_in_the_last_chunk_does_not_unfinish_a_run(tmp_path, fake):
+def test_a_run_with_a_signal_in_its_last_chunk_is_finished(tmp_path, fake):
     def loss(env_steps):
         if env_steps == 96:
             os.kill(os.getpid(), signal.SIGINT)
@@ -581,7 +583,7 @@ def test_a_signal_in_the_last_chunk_does_not_unfinish_a_run(tmp_path, fake):
     assert run(tiny.CONFIG, tmp_path, console=console).exit_code == 130
     text = console.file.getvalue()
     assert "finished at 96 env steps" in text
-    assert "go on with: vawm.runs.runner.run(config" in text
+    assert "vawm.runs.runner.run(config" in text
     assert "resume with" not in text
 
 
@@ -594,7 +596,7 @@ def test_bad_input_is_refused_with_nothing_written(tmp_path, changes):
     assert not list(tmp_path.iterdir())
 
 
-def test_environments_on_the_host_are_closed_where_a_run_is_refused(tmp_path):
+def test_environments_on_the_host_are_closed_if_a_run_is_refused(tmp_path):
     class Host:
         closed = 0
 
@@ -602,7 +604,7 @@ def test_environments_on_the_host_are_closed_where_a_run_is_refused(tmp_path):
             self.closed += 1
 
     env = Host()
-    with pytest.raises(InvalidInput, match="num_envs=0"):
+    with refused("num_envs", 0):
         runner.run(tiny.config(num_envs=0), tmp_path / "run", env=env)
     assert env.closed == 1
 
@@ -612,32 +614,32 @@ def test_environments_that_cannot_be_started_are_one_line(tmp_path, monkeypatch)
         raise OSError(errno.EMFILE, "Too many open files")
 
     monkeypatch.setattr(runner, "prepare", no_room)
-    with pytest.raises(RunError, match="Too many open files; put that right"):
+    with pytest.raises(RunError, match="Too many open files"):
         run(tiny.CONFIG, tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 
 def test_a_run_that_does_not_fit_is_refused_with_nothing_written(tmp_path, monkeypatch):
     monkeypatch.setattr(budget, "available", lambda: {"device": 1000})
-    with pytest.raises(InvalidInput, match=r"replay.capacity=64: needs .* are free"):
+    with refused("replay.capacity", 64):
         run(tiny.CONFIG, tmp_path / "run")
     assert not list(tmp_path.iterdir())
 
 
-def test_every_task_can_be_named(tmp_path):
+def test_every_task_is_accepted(tmp_path):
     for task in envs.TASKS:
         runner.check(tiny.config(task=task), tmp_path / "run", resume=False)
 
 
 @pytest.fixture(scope="module")
 def uninterrupted(tmp_path_factory):
-    """A folder with a whole run of `tiny.CONFIG`, twice as long."""
+    """The folder of a complete run of `tiny.CONFIG`, twice as long."""
     logdir = tmp_path_factory.mktemp("uninterrupted")
     run(LONG, logdir)
     return logdir
 
 
-def test_a_line_reports_what_was_promised(uninterrupted):
+def test_a_line_has_all_documented_metrics(uninterrupted):
     last = lines(uninterrupted)[-1]
     names = ["env_steps", "updates", "time", "env_steps_per_s", "updates_per_s", "latent/kl"]
     names += ["episode/return", "episode/length", "episode/count", "env/nonfinite"]
@@ -647,15 +649,15 @@ def test_a_line_reports_what_was_promised(uninterrupted):
 
 
 @pytest.mark.parametrize("env_steps", [96, 104])
-def test_k_steps_and_the_rest_equal_a_run_in_one_piece(tmp_path, uninterrupted, env_steps):
-    """104 is not a multiple of `log_every`: its last line is written and dropped again."""
+def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path, uninterrupted, env_steps):
+    """104 is not a multiple of `log_every`: the last line is written, then dropped."""
     run(tiny.config(env_steps=env_steps), tmp_path)
     run(LONG, tmp_path, resume=True)
     assert_same(tmp_path, uninterrupted, LONG, tiny.env())
     assert starts(tmp_path) == [97]
 
 
-def test_a_run_whose_newest_checkpoint_is_damaged_goes_on_from_the_one_before(
+def test_a_run_whose_newest_checkpoint_is_damaged_resumes_from_the_one_before(
     tmp_path, uninterrupted
 ):
     logdir = shutil.copytree(uninterrupted, tmp_path / "run")
@@ -665,24 +667,25 @@ def test_a_run_whose_newest_checkpoint_is_damaged_goes_on_from_the_one_before(
     run(LONG, logdir, resume=True, console=console)
     [line] = [line for line in console.file.getvalue().splitlines() if "WARNING" in line]
     assert str(damaged) in line
-    assert line.endswith("using the one at 160 env steps instead")
-    assert "going on at 160 env steps" in console.file.getvalue().splitlines()
+    assert "160 env steps" in line
+    assert "resuming at 160 env steps" in console.file.getvalue().splitlines()
     assert (checkpoint.root(logdir) / "damaged-000000000192").is_dir()
     assert saves(logdir) == saves(uninterrupted)
     assert_same(logdir, uninterrupted, LONG, tiny.env())
 
 
-def test_another_jax_is_told_because_bits_may_differ(tmp_path, monkeypatch):
+def test_resuming_with_another_jax_causes_a_warning(tmp_path, monkeypatch):
     run(tiny.CONFIG, tmp_path)
     monkeypatch.setattr(manifest, "computed", lambda: "jax 99 on gpu")
     console = quiet()
     run(tiny.config(env_steps=104), tmp_path, resume=True, console=console)
-    now = f"jax {jax.__version__} on cpu"
-    assert f"WARNING: begun with {now}, goes on with jax 99 on gpu: " in console.file.getvalue()
+    [line] = [line for line in console.file.getvalue().splitlines() if "WARNING" in line]
+    assert f"jax {jax.__version__} on cpu" in line
+    assert "jax 99 on gpu" in line
 
 
 def starts(logdir):
-    """From where on TensorBoard drops what an earlier part of the run wrote."""
+    """The steps from which TensorBoard drops what an earlier part of the run wrote."""
     sessions = [event for event in events(logdir) if event.HasField("session_log")]
     assert all(event.session_log.status == SessionLog.START for event in sessions)
     return [event.step for event in sessions]
@@ -705,12 +708,12 @@ def test_metrics_that_cannot_be_cut_back_are_explained_and_kept(
     logdir = shutil.copytree(uninterrupted, tmp_path / "run")
     before = measured(logdir)
     monkeypatch.setattr(runner.tracking.pathlib.Path, "write_text", full)
-    with pytest.raises(runner.RunError, match=r"metrics.jsonl.tmp: No space left on device"):
+    with pytest.raises(runner.RunError, match=r"metrics.jsonl.tmp.*No space left on device"):
         run(tiny.config(env_steps=200), logdir, resume=True)
     assert measured(logdir) == before
 
 
-def test_a_run_that_a_signal_stopped_goes_on_as_if_nothing_had_happened(
+def test_a_run_stopped_by_a_signal_and_resumed_equals_an_uninterrupted_one(
     tmp_path, uninterrupted
 ):
     console = rich.console.Console(file=SignalAt("env_steps 84/"), width=200)

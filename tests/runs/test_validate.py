@@ -7,9 +7,9 @@ import pytest
 import tiny
 import tiny_storm
 
-from vawm import config as config_lib
 from vawm import presets
 from vawm.agent import registry, with_size
+from vawm.config import AdamConfig, LaPropConfig
 from vawm.errors import InvalidInput
 from vawm.runs import suites, validate
 from vawm.types import image
@@ -260,11 +260,11 @@ CUSTOM_STORM = changed("size", "custom", STORM)
             "world_model='StormConfig': .*RSSMConfig",
         ),
         (
-            changed("optimizer", config_lib.LaPropConfig(), STORM),
+            changed("optimizer", LaPropConfig(), STORM),
             "optimizer='LaPropConfig': .*AdamConfig",
         ),
         (
-            changed("optimizer", config_lib.AdamConfig()),
+            changed("optimizer", AdamConfig()),
             "optimizer='AdamConfig': .*LaPropConfig",
         ),
         (

@@ -1,4 +1,4 @@
-"""Harm done to files of a checkpoint, and what must come of it."""
+"""Damages files of a checkpoint and checks that they are refused."""
 
 import pytest
 import toy
@@ -23,7 +23,7 @@ def delete(file):
 
 
 def harms(rng):
-    """Name -> what does it to a file, one of all `files`."""
+    """Functions that damage a file of all `files`."""
 
     def at(content):
         return rng.randrange(len(content))
@@ -65,9 +65,9 @@ def harms(rng):
 
 
 def corrupt(logdir, expected, count, rng):
-    """Does something to the only checkpoint, which holds `expected`, `count` times.
+    """Damages the only checkpoint, which holds `expected`, `count` times, one way each time.
 
-    Returns how often that was refused, as it has to be where a file has changed.
+    Returns how often that was refused: every time that a file has changed.
     """
     files = files_of(logdir)
     contents = {file: file.read_bytes() for file in files}

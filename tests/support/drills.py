@@ -1,52 +1,51 @@
-"""Drills: what may go wrong in a single run, done on purpose, and what has to follow.
+"""Drills: deliberate failures of a single run, with the required outcome.
 
     python tests/support/drills.py [NAME ...] [--count N]
 
-runs those that take minutes, all of them unless some are named: `kill`, `term`, `flip`, `full`,
+runs the drills that take minutes, all or only those named: `kill`, `term`, `flip`, `full`,
 `devices`, `huge`, `fuzz`, `corrupt`. It prints a table and exits with 1 if one of them
-failed. `--count` takes the place of the number of tries of `kill`, `term`, `fuzz` and
-`corrupt`.
+failed. `--count` sets the number of tries of `kill`, `term`, `fuzz` and `corrupt`.
 
-All drills, and the tests or the programs of this file that are they:
+All drills, each with its tests or its function in this file:
 
- 1  SIGKILL at random moments: whole lines, none twice or missing, whole checkpoints
+ 1  SIGKILL at random moments: complete lines, none twice or missing, undamaged checkpoints
         support/drills::kill
-        runs/checkpoint/test_saver::test_whenever_a_run_is_killed_a_whole_checkpoint_is_left
+        runs/checkpoint/test_saver::test_a_run_killed_at_any_moment_leaves_an_undamaged_checkpoint
         runs/reports/test_tracking::test_truncation_drops_later_lines_and_half_a_line
-        runs/test_resume::test_lines_that_are_missing_from_what_a_run_goes_on_from_are_told
- 2  A resumed run equals one in one piece bit for bit
+        runs/test_resume::test_missing_and_damaged_lines_before_the_checkpoint_cause_a_warning
+ 2  A resumed run equals an uninterrupted one bit for bit
         support/drills::kill
-        runs/test_runner::test_k_steps_and_the_rest_equal_a_run_in_one_piece
+        runs/test_runner::test_a_resumed_run_equals_an_uninterrupted_one
         learning/test_host_train::test_a_run_that_is_resumed_equals_one_in_one_piece
- 3  SIGTERM, SIGINT, SIGHUP: a checkpoint, exit codes 143, 130, 129; the second ends at once
+ 3  SIGTERM, SIGINT, SIGHUP: a checkpoint, exit codes 143, 130, 129; the second one kills
         support/drills::term
-        runs/test_runner::test_a_run_that_a_signal_stopped_goes_on_as_if_nothing_had_happened
+        runs/test_runner::test_a_run_stopped_by_a_signal_and_resumed_equals_an_uninterrupted_one
         process/test_signals::test_signals_end_a_process_with_the_code_that_shells_expect
  4  One byte flipped in every file of a checkpoint
         support/drills::flip
         support/drills::corrupt
         runs/checkpoint/test_damage::test_damage_to_any_file_is_named_and_the_one_before_is_used
-        runs/test_runner::test_a_run_whose_newest_checkpoint_is_damaged_goes_on_from_the_one_before
- 5  Truncated and deleted files, empty folders, unfinished checkpoints
+        runs/test_runner::test_a_run_whose_newest_checkpoint_is_damaged_resumes_from_the_one_before
+ 5  Truncated and deleted files, empty folders, incomplete checkpoints
         support/drills::flip
         runs/checkpoint/test_damage::test_damage_to_any_file_is_named_and_the_one_before_is_used
-        runs/checkpoint/test_damage::test_an_empty_folder_is_passed_over
-        runs/checkpoint/test_damage::test_what_is_not_complete_is_no_checkpoint
-        runs/checkpoint/test_damage::test_only_empty_folders_are_no_reason_to_start_over
-        runs/test_resume::test_a_run_whose_checkpoints_are_gone_is_not_started_over
-        runs/test_resume::test_a_run_that_saved_by_the_clock_is_not_started_over_either
+        runs/checkpoint/test_damage::test_an_empty_folder_is_skipped
+        runs/checkpoint/test_damage::test_incomplete_and_renamed_checkpoints_are_ignored
+        runs/checkpoint/test_damage::test_a_run_with_only_empty_checkpoint_folders_is_not_restarted
+        runs/test_resume::test_a_run_whose_checkpoints_are_missing_is_not_restarted
+        runs/test_resume::test_a_run_that_saved_by_time_is_not_restarted_either
         runs/test_run_folder::test_files_that_are_not_of_a_run_are_not_put_aside
  6  A full disk while saving and while logging
         support/drills::full
         runs/test_runner::test_a_disk_that_is_full_when_saving_ends_the_run_and_keeps_the_checkpoint
         runs/test_runner::test_a_full_disk_is_explained_in_one_line
-        runs/reports/test_tracking::test_a_full_disk_is_an_error_of_the_line_that_meets_it
-        process/test_streams::test_a_program_outlives_its_standard_output
+        runs/reports/test_tracking::test_a_full_disk_is_an_error_when_a_line_is_written
+        process/test_streams::test_a_program_survives_the_loss_of_its_standard_output
  7  A folder that cannot be written to
         runs/test_run_folder::test_a_path_through_a_file_is_refused
         runs/test_run_folder::test_a_folder_without_permission_is_refused
         runs/test_runner::test_bad_input_is_refused_with_nothing_written
-        runs/test_runner::test_checkpoints_that_could_not_be_written_are_refused_before_training
+        runs/test_runner::test_a_checkpoint_folder_that_is_not_writable_is_refused_before_training
  8  Two runs in one folder; the lock of a dead process
         runs/test_run_folder::test_a_second_claim_is_refused_and_names_the_holder
         runs/test_run_folder::test_the_lock_of_a_killed_process_is_free
@@ -68,20 +67,20 @@ All drills, and the tests or the programs of this file that are they:
         envs/test_stream::test_a_nan_action_counts_as_zero_and_a_large_one_is_clipped
 11  A loss that is NaN: the run stops, with a diagnosis
         runs/test_runner::test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_checkpoint
-        runs/test_runner::test_a_loss_that_is_not_finite_is_told_though_a_save_has_failed
+        runs/test_runner::test_a_loss_that_is_not_finite_is_reported_even_if_a_save_failed
         runs/test_runner::test_rewards_that_are_nan_in_replay_stop_the_run_and_are_named
         runs/checkpoint/test_checkpoint::test_parameters_that_are_not_finite_are_not_saved
 12  Environments that raise, die or hang
         envs/test_host_pool::test_a_failure_names_environment_and_step_and_ends_the_pool
-        envs/test_host_pool::test_a_failure_can_begin_a_new_episode_instead
+        envs/test_host_pool::test_a_failure_can_start_a_new_episode_instead
         envs/test_host_pool::test_a_worker_that_is_killed_from_outside_is_noticed
         learning/test_host_train::test_an_environment_that_fails_ends_the_run_in_one_line
         learning/test_host_train::test_an_environment_that_may_restart_does_and_is_counted
-13  Environments that are none: dtype, shape, range, flags
+13  Invalid environments: dtype, shape, range, flags
         envs/test_host_gymnasium::test_a_problem_is_named_with_a_remedy
         envs/test_host_gymnasium::test_all_problems_come_at_once
-        envs/test_host_pool::test_unsound_outcomes_are_named
-14  Choices with a typo, of a wrong type, or that do not go together
+        envs/test_host_pool::test_invalid_outcomes_are_named
+14  Choices with a typo, of a wrong type, or that conflict
         support/drills::fuzz
         runs/test_fuzz::test_a_config_is_refused_by_the_name_of_a_choice_or_not_at_all
         runs/test_fuzz::test_so_is_one_for_images_in_any_suite_on_the_host
@@ -91,19 +90,19 @@ All drills, and the tests or the programs of this file that are they:
         runs/checkpoint/test_checkpoint::test_another_width_is_refused_with_both_shapes
         runs/checkpoint/test_checkpoint::test_a_leaf_that_differs_is_named
         runs/test_resume::test_another_choice_is_refused_by_name
-        runs/checkpoint/test_hostile::test_a_manifest_that_says_something_else_is_refused
-        runs/test_run_folder::test_a_config_of_another_version_says_which_and_what_to_do
-        runs/test_resume::test_what_another_version_began_is_refused_though_it_could_be_read
-        test_export::test_a_policy_of_another_version_is_told_in_the_log
+        runs/checkpoint/test_hostile::test_a_manifest_with_wrong_content_is_refused
+        runs/test_run_folder::test_a_config_of_another_version_is_refused_with_the_version_and_a_remedy
+        runs/test_resume::test_a_run_of_another_version_is_refused_even_if_it_can_be_read
+        test_export::test_a_policy_of_another_version_is_loaded_with_a_warning
 16  Malicious checkpoints
-        runs/checkpoint/test_hostile::test_a_pickle_in_the_place_of_any_file_is_not_executed
+        runs/checkpoint/test_hostile::test_a_pickle_instead_of_any_file_is_not_executed
         runs/checkpoint/test_hostile::test_a_file_elsewhere_is_refused
-        runs/checkpoint/test_hostile::test_a_link_is_refused_though_what_it_leads_to_is_right
+        runs/checkpoint/test_hostile::test_a_link_to_the_right_file_is_refused
         runs/checkpoint/test_hostile::test_a_huge_manifest_is_not_read
-        runs/checkpoint/test_hostile::test_small_files_do_not_unfold_into_huge_parameters
+        runs/checkpoint/test_hostile::test_small_files_do_not_expand_to_huge_parameters
         runs/test_budget::test_a_policy_that_does_not_fit_is_refused_with_the_numbers
         test_export::test_a_damaged_file_is_one_line
-17  More than memory holds
+17  Runs too large for the memory
         runs/test_budget::test_five_million_images_are_refused_with_the_numbers
         runs/test_budget::test_what_does_not_fit_is_refused_with_the_largest_replay_that_would
         runs/test_runner::test_a_run_that_does_not_fit_is_refused_with_nothing_written
@@ -112,15 +111,15 @@ All drills, and the tests or the programs of this file that are they:
         learning/test_train::test_the_step_is_deterministic_and_seeds_differ
         learning/test_train::test_two_seeds_vmapped_equal_the_two_runs_alone
         envs/test_stream::test_equal_keys_give_equal_episodes_and_different_keys_do_not
-19  A further backend that is down
-        runs/reports/test_backends::test_a_backend_that_fails_is_one_warning_and_the_run_goes_on
-        runs/reports/test_backends::test_a_backend_that_hangs_costs_a_bounded_wait_at_the_end
-        runs/reports/test_backends::test_a_run_that_was_begun_goes_on_without_a_package_that_is_gone
+19  A tracking backend that is down
+        runs/reports/test_backends::test_a_backend_that_fails_causes_one_warning_and_the_run_continues
+        runs/reports/test_backends::test_a_backend_that_hangs_delays_the_end_for_a_limited_time
+        runs/reports/test_backends::test_a_resumed_run_continues_without_a_package_that_was_removed
         runs/test_runner::test_a_tracker_that_fails_changes_nothing_but_one_line_of_output
-20  Steps that go backwards, clocks that jump
-        runs/checkpoint/test_checkpoint::test_a_run_does_not_go_backwards
-        runs/checkpoint/test_saver::test_going_backwards_is_refused_before_anything_is_copied
-        runs/checkpoint/test_saver::test_time_is_counted_from_the_save_before
+20  Env steps that decrease, clocks that jump
+        runs/checkpoint/test_checkpoint::test_a_checkpoint_older_than_the_newest_is_refused
+        runs/checkpoint/test_saver::test_an_older_checkpoint_is_refused_before_anything_is_copied
+        runs/checkpoint/test_saver::test_time_is_counted_from_the_previous_save
         runs/test_runner::test_a_chunk_without_a_step_forward_is_not_saved_again
 21  Another number of devices
         support/drills::devices
@@ -167,23 +166,23 @@ from vawm.process import cache
 from vawm.runs import checkpoint, runner
 
 GRACE = 30  # seconds between a signal and the end
-PATIENCE = 600  # seconds for a run to come to where it is awaited
+PATIENCE = 600  # seconds for a run to reach given env steps
 LOG_EVERY = 16
 
 
 class Outcome(NamedTuple):
-    """How a drill ended: tries, and what was seen."""
+    """How a drill ended: the number of tries, and what happened."""
 
     tries: int
     seen: str
 
 
 class Skipped(Exception):
-    """A drill that cannot be done here."""
+    """A drill that cannot run on this machine."""
 
 
 def config_for(env_steps: int, save_every: int = 16) -> Config:
-    """A tiny run that logs and saves all the time."""
+    """A tiny run that logs and saves often."""
     return tiny.config(env_steps=env_steps, log_every=LOG_EVERY, save_every=save_every)
 
 
@@ -191,7 +190,7 @@ def config_for(env_steps: int, save_every: int = 16) -> Config:
 
 
 def train(logdir: str, env_steps: int, save_every: int) -> int:
-    """What a child process does: begins or resumes a run."""
+    """Starts or resumes a run, in a child process."""
     console = rich.console.Console(width=200)
     print(f"devices: {jax.device_count()}", flush=True)
     begun = (pathlib.Path(logdir) / "config.json").exists()
@@ -209,9 +208,9 @@ def train(logdir: str, env_steps: int, save_every: int) -> int:
 
 
 class Child:
-    """A child process that trains; it has ended when this is left.
+    """A child process that trains; a context manager that kills it at the end.
 
-    What it prints goes into a file: nobody would read a pipe, and a full one stops who writes.
+    Its output goes to a file: nothing reads a pipe, and a full pipe would block the child.
     """
 
     def __init__(
@@ -240,13 +239,13 @@ class Child:
 
 
 def with_devices(count: int) -> str:
-    """Flags of XLA with which a CPU is so many devices."""
+    """XLA flags that make a CPU count as several devices."""
     flags = os.environ.get("XLA_FLAGS", "")
     return f"{flags} --xla_force_host_platform_device_count={count}".strip()
 
 
 def finish(logdir: pathlib.Path, env_steps: int, save_every: int = 16, devices: int = 1) -> str:
-    """A run, begun or resumed, to its end; returns what it printed."""
+    """Starts or resumes a run, waits for its end, and returns its output."""
     with Child(logdir, env_steps, save_every, devices) as child:
         code = child.process.wait(timeout=PATIENCE)
         assert code == 0, child.said()[-2000:]
@@ -254,14 +253,14 @@ def finish(logdir: pathlib.Path, env_steps: int, save_every: int = 16, devices: 
 
 
 def reached(logdir: pathlib.Path) -> int:
-    """Env steps of the last whole line of metrics."""
+    """Env steps of the last complete line of metrics."""
     with contextlib.suppress(OSError, ValueError, IndexError):
         return json.loads((logdir / "metrics.jsonl").read_bytes().splitlines()[-1])["env_steps"]
     return 0
 
 
 def wait_for(logdir: pathlib.Path, env_steps: int, child: Child) -> None:
-    """Waits until a run has come so far; fails if it ends before."""
+    """Waits until a run has reached `env_steps`; fails if it ends before."""
     end = time.monotonic() + PATIENCE
     while reached(logdir) < env_steps:
         ended = child.process.poll() is not None and reached(logdir) < env_steps
@@ -271,7 +270,7 @@ def wait_for(logdir: pathlib.Path, env_steps: int, child: Child) -> None:
 
 
 def check_metrics(logdir: pathlib.Path, env_steps: int) -> None:
-    """Every line is whole, and they are those of every interval, in order."""
+    """Checks that every line is complete and that there is one per interval, in order."""
     text = (logdir / "metrics.jsonl").read_text()
     assert text.endswith("\n")
     steps = [json.loads(line)["env_steps"] for line in text.splitlines()]
@@ -283,7 +282,7 @@ def check_metrics(logdir: pathlib.Path, env_steps: int) -> None:
 
 
 def kill(folder: pathlib.Path, count: int = 30) -> Outcome:
-    """SIGKILL, most times while it trains, logs and saves, every fifth time while it starts."""
+    """SIGKILL, usually during training and saving, every fifth time during the start."""
 
     def strike(child: Child, number: int, target: int) -> None:
         if number % 5 == 4:
@@ -301,7 +300,7 @@ def kill(folder: pathlib.Path, count: int = 30) -> Outcome:
 
 
 def term(folder: pathlib.Path, count: int = 10) -> Outcome:
-    """SIGTERM and SIGINT by turns."""
+    """SIGTERM and SIGINT in turns."""
     slowest = 0.0
 
     def strike(child: Child, number: int, target: int) -> None:
@@ -328,7 +327,7 @@ def interrupt(
     count: int,
     strike: Callable[[Child, int, int], None],
 ) -> Outcome:
-    """A run that is struck `count` times and resumed each time equals one that never was."""
+    """Interrupts a run `count` times, resumes it, and compares with an uninterrupted run."""
     env_steps = 192 + 96 * count
     targets = sorted(RANDOM.randrange(LOG_EVERY, env_steps - 96) for _ in range(count))
     for number, target in enumerate(targets):
@@ -339,7 +338,7 @@ def interrupt(
     for name in ("run", "whole"):
         check_metrics(folder / name, env_steps)
     runs.assert_same(folder / "run", folder / "whole", config_for(env_steps), tiny.env())
-    return Outcome(count, f"{env_steps} env steps as in one piece, bit for bit")
+    return Outcome(count, f"{env_steps} env steps as uninterrupted, bit for bit")
 
 
 def flip(folder: pathlib.Path) -> Outcome:
@@ -357,7 +356,7 @@ def flip(folder: pathlib.Path) -> Outcome:
             file.write_bytes(content)
             tries += 1
     assert checkpoint.find(folder / "run").path == newest
-    return Outcome(tries, "each named, and the checkpoint before used")
+    return Outcome(tries, "each named, and the previous checkpoint used")
 
 
 def corrupt(folder: pathlib.Path, count: int = 500) -> Outcome:
@@ -367,14 +366,14 @@ def corrupt(folder: pathlib.Path, count: int = 500) -> Outcome:
     newest = checkpoint.latest(folder / "run")
     assert newest
     shutil.copytree(newest, folder / "one" / "checkpoints" / newest.name)
-    with contextlib.closing(runner.prepare(config_for(96), tiny.env())) as program:
-        expected, _ = checkpoint.restore(folder / "one", program.shapes)
+    with contextlib.closing(runner.prepare(config_for(96), tiny.env())) as trainer:
+        expected, _ = checkpoint.restore(folder / "one", trainer.shapes)
     refused = damage.corrupt(folder / "one", expected, count, RANDOM)
     return Outcome(count, f"{refused} refused in one line, {count - refused} changed nothing")
 
 
 def full(folder: pathlib.Path) -> Outcome:
-    """A disk of 10 MB that is full: while saving, and while logging."""
+    """A full disk of 10 MB, while saving and while logging."""
     mount = ["mount", "-t", "tmpfs", "-o", "size=10m", "tmpfs"]
     seen = []
     for what, save_every in (("saving", 16), ("logging", 10**6)):
@@ -391,13 +390,13 @@ def full(folder: pathlib.Path) -> Outcome:
 
 
 def fill(disk: pathlib.Path, save_every: int) -> str:
-    """Fills the disk under a run, which has to end in one line and to go on afterwards."""
+    """Fills the disk of a run: it must end with one line and be resumable afterwards."""
     logdir, filler, env_steps = disk / "run", disk / "filler", 4000
     with Child(logdir, env_steps, save_every) as child:
         wait_for(logdir, 64, child)
         deadline = time.monotonic() + PATIENCE
         while child.process.poll() is None:  # it deletes old checkpoints meanwhile
-            assert time.monotonic() < deadline, "goes on with a full disk"
+            assert time.monotonic() < deadline, "continues with a full disk"
             with contextlib.suppress(OSError), filler.open("ab", buffering=0) as file:
                 while child.process.poll() is None:
                     file.write(bytes(1024))
@@ -418,18 +417,18 @@ def fill(disk: pathlib.Path, save_every: int) -> str:
     finish(logdir, end, save_every)
     check_metrics(logdir, end)
     kept = f"kept {int(newest.name)}" if newest else "no checkpoint yet"
-    return f"{told[0].replace(str(logdir), 'LOGDIR')} ({kept}, and went on)"
+    return f"{told[0].replace(str(logdir), 'LOGDIR')} ({kept}, then resumed)"
 
 
 def devices(folder: pathlib.Path) -> Outcome:
-    """A run on one device goes on where there are four, and then on one again."""
+    """A run on one device is resumed on four, and then on one again."""
     for env_steps, count in ((64, 1), (128, 4), (192, 1)):
         said = finish(folder / "run", env_steps, devices=count)
         assert f"devices: {count}\n" in said, said[-2000:]
     finish(folder / "whole", 192)
     check_metrics(folder / "run", 192)
     runs.assert_same(folder / "run", folder / "whole", config_for(192), tiny.env())
-    return Outcome(3, "1, 4 and 1 devices, as on one in one piece, bit for bit")
+    return Outcome(3, "1, 4 and 1 devices, as uninterrupted on one, bit for bit")
 
 
 def huge(folder: pathlib.Path) -> Outcome:
@@ -438,11 +437,11 @@ def huge(folder: pathlib.Path) -> Outcome:
     for config in huge_numbers.AGENTS:
         huge_numbers.learn_from_them(config)
     names = [config.agent for config in huge_numbers.AGENTS]
-    return Outcome(len(names), f"{', '.join(names)}: all that is learned stays finite")
+    return Outcome(len(names), f"{', '.join(names)}: all parameters stay finite")
 
 
 def fuzz(folder: pathlib.Path, count: int = 2000) -> Outcome:
-    """Random configs are refused by name, or they train: each is compiled and makes updates."""
+    """Random configs are refused by name, or they compile and make updates."""
     accepted: dict[Config, int] = {}
     refused = 0
 
@@ -473,7 +472,7 @@ def fuzz(folder: pathlib.Path, count: int = 2000) -> Outcome:
 
 
 def run_alone(config: Config) -> str:
-    """`fuzzing.run`, and what was compiled for it leaves the memory."""
+    """Calls `fuzzing.run`, then frees the compiled functions."""
     try:
         return fuzzing.run(config)
     finally:
@@ -481,7 +480,7 @@ def run_alone(config: Config) -> str:
 
 
 def run_all(configs: list[Config]) -> Iterator[str]:
-    """What comes of each of them, in processes of their own, compiled in a hurry."""
+    """Runs all configs in separate processes, compiled without optimisation."""
     hurry.hurry()
     spawn = multiprocessing.get_context("spawn")
     with concurrent.futures.ProcessPoolExecutor(mp_context=spawn) as pool:
@@ -504,8 +503,8 @@ RANDOM = random.Random()
 def main() -> int:
     parser = argparse.ArgumentParser()
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(DRILLS)}")
-    parser.add_argument("--count", type=int, help="tries, in the place of the usual number")
-    parser.add_argument("--seed", type=int, default=0, help="of all that is random")
+    parser.add_argument("--count", type=int, help="number of tries, instead of the default")
+    parser.add_argument("--seed", type=int, default=0, help="seed of all random choices")
     arguments = parser.parse_args()
     if unknown := set(arguments.names) - set(DRILLS):
         parser.error(f"{', '.join(sorted(unknown))}: use some of {', '.join(DRILLS)}")

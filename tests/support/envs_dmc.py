@@ -12,7 +12,7 @@ RANDOM, BANG_BANG, POSED = "random", "bang-bang", "posed"
 
 
 class Transitions(NamedTuple):
-    """States of C, an action in each, and what C makes of them; all float64 `[B, ...]`."""
+    """States of C MuJoCo, an action in each, and the results; all float64 `[B, ...]`."""
 
     qpos: np.ndarray
     qvel: np.ndarray
@@ -26,7 +26,7 @@ class Transitions(NamedTuple):
 
 
 def load(name: str, seed: int = 0):
-    """dm_control's environment; its model's deprecation warning would go to a file."""
+    """dm_control's environment, without the deprecation warning that goes to a file."""
     mujoco.set_mju_user_warning(lambda message: None)
     domain, task = split(name)
     return suite.load(domain, task, task_kwargs={"random": seed})
@@ -48,7 +48,7 @@ def target(env, name: str) -> np.ndarray:
 
 
 def set_target(env, name: str, value: np.ndarray) -> None:
-    """Puts the target where `value` says."""
+    """Puts the target at `value`."""
     model = env.physics.named.model
     if name.startswith("reacher"):
         model.geom_pos["target", ["x", "y"]] = value
@@ -66,7 +66,7 @@ def place(env, name: str, qpos, qvel, goal) -> np.ndarray:
 
 
 def pose(env, name: str, rng: np.random.RandomState) -> None:
-    """A state near reward, which random sequences hardly find."""
+    """Puts the environment near a reward, which random actions rarely reach."""
     physics = env.physics
     qpos, qvel, goal = physics.data.qpos.copy(), np.zeros(physics.model.nv), target(env, name)
     if name == "finger_spin":
@@ -85,7 +85,7 @@ def pose(env, name: str, rng: np.random.RandomState) -> None:
 def hold(name: str, seen: Transitions, action: np.ndarray, *, steps: int):
     """Last observations and summed rewards of `steps` steps of C from the states of `seen`.
 
-    Each takes one of the actions `[B, nu]`, which C clips to the range of its actuators.
+    Each holds its row of the actions `[B, nu]`, which C clips to the range of its actuators.
     """
     env, obs, reward = load(name), [], []
     for start, held in zip(zip(*seen, strict=True), action, strict=True):

@@ -19,9 +19,8 @@ import tiny_storm
 import tiny_vagram
 from hypothesis import strategies as st
 
-from vawm import config as config_lib
 from vawm.agent import make_agent
-from vawm.config import Config
+from vawm.config import Config, HostEnvConfig
 from vawm.errors import InvalidInput
 from vawm.learning import train
 from vawm.runs import diagnosis, runner, suites, validate
@@ -37,7 +36,7 @@ PIXELS = {
         env_steps=4 * tiny.CONFIG.env_steps,
     )
     for suite, record in suites.SUITES.items()
-    if issubclass(record.choices, config_lib.HostEnvConfig)
+    if issubclass(record.choices, HostEnvConfig)
 }
 """From images, in environments of every suite on the host."""
 BASES = {"dreamerv3": tiny.CONFIG, "storm": tiny_storm.CONFIG, "vagram": tiny_vagram.CONFIG}

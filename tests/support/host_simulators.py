@@ -1,4 +1,4 @@
-"""Small simulators for tests of pools, and their stream in a plain loop."""
+"""Small simulators for tests of pools, and their stream from a plain loop."""
 
 import ctypes
 import os
@@ -15,7 +15,7 @@ from vawm.types import image, vector
 
 
 class Walk:
-    """A walk of 3 to 6 steps. All it returns lies in arrays that it uses again."""
+    """A walk of 3 to 6 steps. It returns the same arrays every time."""
 
     obs = {"state": vector(3), "picture": image(4, channels=1)}  # noqa: RUF012
     action_size = 2
@@ -50,8 +50,10 @@ class Walk:
 
 
 class Troubled(Walk):
-    """A walk in which something happens at a step of every episode, or of those of some
-    seeds: `trouble` is the name of what, or such names by seed."""
+    """A walk with trouble at a given step of every episode, or of those of some seeds.
+
+    `trouble` is the name of a method below, or a dict of names by seed.
+    """
 
     def __init__(self, trouble, *, step):
         super().__init__()
@@ -91,7 +93,7 @@ class Troubled(Walk):
 
 
 class BadEnd(Troubled):
-    """One that has been in trouble does not survive being closed either."""
+    """A troubled walk that also does not survive being closed."""
 
     def __init__(self, trouble, *, step, end):
         super().__init__(trouble, step=step)
@@ -103,7 +105,7 @@ class BadEnd(Troubled):
 
 
 class Echo:
-    """Shows the action that it got."""
+    """Returns the action that it got as its observation."""
 
     obs = vector(3)
     action_size = 3
@@ -124,7 +126,7 @@ class Echo:
 
 
 class Chance(Walk):
-    """In episodes of odd seeds a walk that nobody can repeat."""
+    """A walk whose episodes of odd seeds cannot be replayed."""
 
     def step(self, action):
         if self.seed % 2:
@@ -140,7 +142,7 @@ class Chance(Walk):
 
 
 class Changed(Walk):
-    """A walk that does what a file says in its second step, if there is one."""
+    """A walk with the trouble that a file names in its second step, if there is a file."""
 
     def __init__(self, path):
         super().__init__()
@@ -163,7 +165,7 @@ class Slow(Walk):
 
 
 class Loud(Walk):
-    """Prints, from Python and from below."""
+    """Prints, from Python and to the file descriptor."""
 
     def step(self, action):
         print("chatter")
@@ -172,7 +174,7 @@ class Loud(Walk):
 
 
 class Parent(Walk):
-    """Has a child process, whose number it shows."""
+    """Has a child process; its observation is the process id."""
 
     obs = vector(1)
 
@@ -183,8 +185,10 @@ class Parent(Walk):
 
 
 def serial_stream(make, seed, actions):
-    """What a pool returns for `[T, N, A]` actions: `T + 1` lists of N tuples
-    (obs, reward, is_first, is_last, is_terminal), in a plain loop."""
+    """The expected stream for `[T, N, A]` actions, from a plain loop.
+
+    `T + 1` lists of N tuples (obs, reward, is_first, is_last, is_terminal).
+    """
     envs = [Stream(make(), seed, env) for env in range(actions.shape[1])]
     rows = [[env.begin() for env in envs]]
     rows += [[env.step(a) for env, a in zip(envs, row, strict=True)] for row in actions]

@@ -1,8 +1,8 @@
-"""A program that saves without a pause in a child, kills it, and looks at what is left.
+"""Starts a child that saves without a pause, kills it, and checks the files. Repeats.
 
     python killed_saver.py LOGDIR
 
-Prints the env steps of the newest checkpoint after each kill, and fails where one is damaged.
+Prints the env steps of the newest checkpoint after each kill; fails if one is damaged.
 """
 
 import os
@@ -21,7 +21,7 @@ KILLS, FIRST, LONGEST = 10, 8, 0.8
 
 
 def state(env_steps):
-    """Arrays of numpy alone, so that no child waits for JAX to compile."""
+    """Numpy arrays only, so that no child waits for JAX to compile."""
     rng = np.random.default_rng(env_steps)
     params = {"kernel": rng.normal(size=(64, 32)).astype(np.float32)}
     replay = rng.integers(0, 255, (4, 10_000)).astype(np.uint8)
@@ -34,14 +34,14 @@ def save_for_ever(logdir, ready):
     with checkpoint.Saver(logdir, tiny.CONFIG, toy.SPEC) as saver:
         while True:
             saver.save(state(env_steps), env_steps=env_steps, progress={})
-            if checkpoint.latest(logdir):  # from now on there has to be one
+            if checkpoint.latest(logdir):  # from now on there must always be one
                 os.write(ready, b"1")
             env_steps += FIRST
 
 
 def main(logdir):
     rng = random.Random(0)
-    for _ in range(KILLS):  # forked before JAX has begun anything
+    for _ in range(KILLS):  # forks before JAX starts threads
         reader, writer = os.pipe()
         child = os.fork()
         if not child:

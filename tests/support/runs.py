@@ -1,4 +1,4 @@
-"""Runs on disk, and what two of them must have in common."""
+"""Helpers for runs on disk, and the comparison of two runs."""
 
 import contextlib
 import io
@@ -20,13 +20,13 @@ def quiet():
 
 
 def save_toy(logdir, state, env_steps=8, **changes):
-    """A checkpoint of `toy.state()` as one of `tiny.CONFIG`."""
+    """Saves a `toy` state as a checkpoint of `tiny.CONFIG`."""
     usual = {"config": tiny.CONFIG, "spec": toy.SPEC, "progress": {}}
     return checkpoint.save(logdir, state, env_steps=env_steps, **usual | changes)
 
 
 def files_of(path):
-    """Every file of a checkpoint in which there is something."""
+    """All files of a checkpoint that are not empty."""
     return sorted(file for file in path.rglob("*") if file.is_file() and file.stat().st_size)
 
 
@@ -35,7 +35,7 @@ def lines(logdir):
 
 
 def measured(logdir):
-    """The lines of metrics without what a clock put there."""
+    """The lines of metrics without times and speeds."""
     return [
         {name: value for name, value in line.items() if name not in WALL_TIME}
         for line in lines(logdir)
@@ -43,7 +43,7 @@ def measured(logdir):
 
 
 def events(logdir):
-    """What TensorBoard's files hold: records of a length, its checksum, data, its checksum."""
+    """The events in TensorBoard's files. A record: length, its checksum, data, its checksum."""
     result = []
     for path in sorted(logdir.glob("events.out.tfevents.*")):
         data = path.read_bytes()
@@ -55,9 +55,9 @@ def events(logdir):
 
 
 def assert_same(actual, expected, config, env=None):
-    """Two whole runs of `config`: the same state bit for bit, the same lines."""
-    with contextlib.closing(runner.prepare(config, env)) as program:
-        shapes = program.shapes
+    """Checks that two complete runs of `config` have the same state bit for bit, and lines."""
+    with contextlib.closing(runner.prepare(config, env)) as trainer:
+        shapes = trainer.shapes
     (state, manifest), (other, other_manifest) = (
         checkpoint.restore(logdir, shapes) for logdir in (actual, expected)
     )

@@ -9,10 +9,19 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from vawm import config as config_lib
+from vawm.config import (
+    ActorConfig,
+    Config,
+    CriticConfig,
+    ImaginationConfig,
+    LaPropConfig,
+    ReplayConfig,
+    RSSMConfig,
+    ValueAlignmentConfig,
+)
 from vawm.envs import Environment, probes
 
-CONFIG = config_lib.Config(
+CONFIG = Config(
     task="probe_observation_action",
     preset="custom",
     size="custom",
@@ -25,19 +34,19 @@ CONFIG = config_lib.Config(
     compute_dtype="float32",
     log_every=16,
     save_every=32,
-    world_model=config_lib.RSSMConfig(
+    world_model=RSSMConfig(
         deter=32, hidden=16, stoch=4, classes=4, units=16, blocks=4, bins=41
     ),
-    actor=config_lib.ActorConfig(layers=1, units=16),
-    critic=config_lib.CriticConfig(layers=1, units=16, bins=41),
-    imagination=config_lib.ImaginationConfig(horizon=3),
-    value_alignment=config_lib.ValueAlignmentConfig(warmup_steps=24),
-    optimizer=config_lib.LaPropConfig(learning_rate=1e-3, warmup_updates=2),
-    replay=config_lib.ReplayConfig(capacity=64, batch_size=2, batch_length=8),
+    actor=ActorConfig(layers=1, units=16),
+    critic=CriticConfig(layers=1, units=16, bins=41),
+    imagination=ImaginationConfig(horizon=3),
+    value_alignment=ValueAlignmentConfig(warmup_steps=24),
+    optimizer=LaPropConfig(learning_rate=1e-3, warmup_updates=2),
+    replay=ReplayConfig(capacity=64, batch_size=2, batch_length=8),
 )
 
 
-def config(**changes: Any) -> config_lib.Config:
+def config(**changes: Any) -> Config:
     """`CONFIG` with some top-level fields replaced."""
     return dataclasses.replace(CONFIG, **changes)
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import tiny
 
-from vawm import config as config_lib
+from vawm.config import Config, GymnasiumConfig, VideoConfig
 from vawm.envs.host.pool import Pool
 from vawm.envs.host.simulator import Outcome
 from vawm.types import image, vector
@@ -18,12 +18,12 @@ CONFIG = dataclasses.replace(
     suite="gymnasium",
     task="lamp",
     world_model=dataclasses.replace(tiny.CONFIG.world_model, depth=1),
-    video=config_lib.VideoConfig(every=48, sequences=2, context=3, episode_steps=4),
-    env=config_lib.GymnasiumConfig(workers=1),
+    video=VideoConfig(every=48, sequences=2, context=3, episode_steps=4),
+    env=GymnasiumConfig(workers=1),
 )
 
 
-def config(images: str = "device", **changes: Any) -> config_lib.Config:
+def config(images: str = "device", **changes: Any) -> Config:
     """`CONFIG` with some top-level fields replaced."""
     replay = dataclasses.replace(CONFIG.replay, images=images)
     return dataclasses.replace(CONFIG, **{"replay": replay} | changes)

@@ -7,13 +7,13 @@ from typing import Any
 
 import tiny
 
-from vawm import config as config_lib
 from vawm import presets
+from vawm.config import AdamConfig, Config, StormConfig
 
 CONFIG = dataclasses.replace(
     tiny.CONFIG,
     agent="storm",
-    world_model=config_lib.StormConfig(
+    world_model=StormConfig(
         deter=32,
         stoch=4,
         classes=4,
@@ -30,16 +30,16 @@ CONFIG = dataclasses.replace(
     imagination=dataclasses.replace(
         presets.STORM.imagination, horizon=3, batch_size=6, context_length=4
     ),
-    optimizer=config_lib.AdamConfig(learning_rate=1e-3, behaviour_learning_rate=1e-2),
+    optimizer=AdamConfig(learning_rate=1e-3, behaviour_learning_rate=1e-2),
 )
 
 
-def config(**changes: Any) -> config_lib.Config:
+def config(**changes: Any) -> Config:
     """`CONFIG` with some top-level fields replaced."""
     return dataclasses.replace(CONFIG, **changes)
 
 
-def storm(like: config_lib.Config, **changes: Any) -> config_lib.Config:
+def storm(like: Config, **changes: Any) -> Config:
     """`like` with tiny STORM as its agent, and further changes."""
     names = ("agent", "world_model", "actor", "critic", "imagination", "optimizer")
     return dataclasses.replace(
@@ -47,6 +47,6 @@ def storm(like: config_lib.Config, **changes: Any) -> config_lib.Config:
     )
 
 
-def model(**changes: Any) -> config_lib.StormConfig:
+def model(**changes: Any) -> StormConfig:
     """Its world model, with some fields replaced."""
     return dataclasses.replace(CONFIG.world_model, **changes)

@@ -125,11 +125,11 @@ def test_planned_memory_is_of_the_largest_program_and_counts_donated_arguments_o
     assert overhead.planned_bytes(EXECUTABLES) == overhead.planned_bytes([donated])
 
 
-class FakeProgram:
+class FakeTrainer:
     """Learns in every fourth step."""
 
     init = staticmethod(lambda seed: 0)
-    compile = staticmethod(lambda state: trainer.CompiledStep(FakeProgram.step, EXECUTABLES))
+    compile = staticmethod(lambda state: trainer.CompiledStep(FakeTrainer.step, EXECUTABLES))
     close = staticmethod(lambda: None)
 
     @staticmethod
@@ -142,7 +142,7 @@ def test_the_process_answers_every_line(monkeypatch):
 
     def prepare(config, *, kept):
         rules.append(kept)
-        return FakeProgram()
+        return FakeTrainer()
 
     monkeypatch.setattr(overhead.runner, "prepare", prepare)
     asked = io.StringIO("sample\nsample\nfinish\nsample\n")

@@ -11,11 +11,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from vawm.analysis import saliency as saliency_lib
-from vawm.analysis import trajectories as trajectories_lib
+from vawm.analysis import saliency
 from vawm.analysis.curves import METRICS, Curves
 from vawm.analysis.saliency import Look
-from vawm.analysis.trajectories import Trajectories
+from vawm.analysis.trajectories import Trajectories, vectors
 from vawm.analysis.values import MEASURES, Group, Report
 from vawm.runs.reports import video
 from vawm.runs.runner import RunError
@@ -175,7 +174,7 @@ def _show(ax: Any, picture: np.ndarray) -> None:
 
 def coordinates(name: str, trajectories: Trajectories, path: pathlib.Path) -> None:
     """Coordinates of the first window over time; of many the ones that move most."""
-    truth, guess = (x[0] for x in trajectories_lib.vectors(trajectories))
+    truth, guess = (x[0] for x in vectors(trajectories))
     inside = trajectories.inside[0]
     moving = np.argsort(-truth[inside].std(0), kind="stable")[:COORDINATES]
     columns = min(4, len(moving))
@@ -202,7 +201,7 @@ def saliency_images(name: str, look: Look, path: pathlib.Path) -> None:
     told = jax.tree.map(video.to_bytes, told, jax.tree.map(lambda x: x[:, None], look.truth))
     decoded = video.side_by_side(told)[:, 0]
     maps = {
-        label: saliency_lib.images(look.truth, getattr(look.saliency, kind))
+        label: saliency.images(look.truth, getattr(look.saliency, kind))
         for kind, label in MAPS.items()
     }
     heats = {label: heat(seen, found) for label, found in maps.items() if found is not None}
@@ -238,7 +237,7 @@ def saliency_vectors(looks: Mapping[str, Look], path: pathlib.Path) -> None:
     with panels(path, 1, len(MAPS), size=(4.2, 3)) as axes:
         for ax, (kind, label) in zip(axes[0], MAPS.items(), strict=True):
             for number, (name, look) in enumerate(looks.items()):
-                found = saliency_lib.coordinates(look.truth, getattr(look.saliency, kind))
+                found = saliency.coordinates(look.truth, getattr(look.saliency, kind))
                 assert found is not None
                 width = 0.8 / len(looks)
                 place = np.arange(found.shape[1]) + (number + 0.5) * width - 0.4

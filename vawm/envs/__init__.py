@@ -4,9 +4,10 @@
     state, timestep = jax.jit(env.reset)(jax.random.key(0))
     state, timestep = jax.jit(env.step)(state, action)
 
-`from_gymnasium` runs any Gymnasium environment, in processes of its own. Importing this
-module is cheap: MuJoCo is loaded by `make`, and what runs processes when it is asked for.
-It registers the tasks with Gymnasium, as `vawm/<task>-v0`, and "vawm/GridWorld-v0".
+`from_gymnasium` runs any Gymnasium environment in separate processes. Importing this module
+is cheap: `make` loads MuJoCo, and the first use of `from_gymnasium` loads what runs the
+processes. The import registers the tasks with Gymnasium, as `vawm/<task>-v0`, and
+"vawm/GridWorld-v0".
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ register(TASKS)
 
 
 def __getattr__(name: str) -> Any:
-    """`from_gymnasium`, imported when it is first asked for."""
+    """Imports `from_gymnasium` on first use."""
     if name == "from_gymnasium":
         from vawm.envs.host.gymnasium import from_gymnasium
 
@@ -55,8 +56,8 @@ def make(task: str, *, num_envs: int, action_repeat: int = 1) -> Environment:
     Args:
       task: one of `TASKS`, such as "walker_walk".
       num_envs: N, environments stepped at once.
-      action_repeat: control steps per call of `step`; their rewards are summed. It
-        divides 1000, the control steps of an episode.
+      action_repeat: control steps per call of `step`; their rewards are summed. Must
+        divide 1000, the control steps of an episode.
 
     Returns:
       An `Environment`; nothing is compiled yet.
@@ -79,7 +80,7 @@ def make(task: str, *, num_envs: int, action_repeat: int = 1) -> Environment:
 
 
 def check_task(task: str) -> None:
-    """Refuses a name outside `TASKS`, with the nearest one."""
+    """Refuses a name outside `TASKS` and suggests the nearest one."""
     if task in TASKS:
         return
     remedy = f"{suggestion(task, TASKS)}choose one of {', '.join(TASKS)}"

@@ -1,8 +1,8 @@
-"""A small world of pixels: walk to the goal, again and again.
+"""A small pixel environment: walk to the goal, then to the next one.
 
 Registered with Gymnasium as "vawm/GridWorld-v0": episodes of 50 steps on 4 x 4 fields, drawn as
-64 x 64 pixels. The reward is 1 for each goal that is reached, upon which the next appears
-somewhere else. Whoever walks straight reaches 18 in an episode, random steps reach 1.6.
+64 x 64 pixels. Reaching the goal gives reward 1 and moves the goal somewhere else. Walking
+straight to each goal returns 18 per episode, random actions return 1.6.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ class GridWorld(gymnasium.Env):
         self.action_space = spaces.Discrete(len(MOVES))
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
-        """Walker and goal on fields of their own."""
+        """Puts walker and goal on two different random fields."""
         super().reset(seed=seed)
         self.walker = self.np_random.integers(FIELDS, size=2)
         self._move_goal()
         return self.render(), {}
 
     def step(self, action: int):
-        """One field; the edge stops the walker."""
+        """Moves by one field; the edge stops the walker."""
         self.walker = np.clip(self.walker + MOVES[action], 0, FIELDS - 1)
         reached = bool((self.walker == self.goal).all())
         if reached:
@@ -46,7 +46,7 @@ class GridWorld(gymnasium.Env):
         return self.render(), float(reached), False, False, {}
 
     def render(self) -> np.ndarray:  # type: ignore[override]
-        """The fields from above."""
+        """`[64, 64, 3]` uint8 picture of the fields from above."""
         picture = np.zeros((SIZE, SIZE, 3), np.uint8)
         for (row, column), color in ((self.goal, GOAL), (self.walker, WALKER)):
             top, left = FIELD * row, FIELD * column
@@ -54,7 +54,7 @@ class GridWorld(gymnasium.Env):
         return picture
 
     def _move_goal(self) -> None:
-        """Anywhere but where the walker is."""
+        """Puts the goal on a random field without the walker."""
         index = self.np_random.integers(FIELDS**2 - 1)
         here = self.walker[0] * FIELDS + self.walker[1]
         self.goal = np.array(divmod(index + (index >= here), FIELDS))

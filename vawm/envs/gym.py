@@ -1,8 +1,8 @@
 """The MJX tasks through Gymnasium: `gymnasium.make("vawm/walker_walk-v0")` and `make_vec`.
 
-Episodes are truncated after 1000 control steps and never terminated. When the physics
-fails, an episode is truncated early and `info["physics_failed"]` says so. Compilation
-happens at the first `reset` and `step`.
+Episodes are truncated after 1000 control steps and never terminated. If the physics fails,
+the episode is truncated early and `info["physics_failed"]` is set. The first `reset` and
+`step` compile.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from vawm.types import EnvSpec, TimeStep
 
 
 class SingleEnv(gymnasium.Env):
-    """One environment, NumPy in and out."""
+    """One environment, numpy in and out."""
 
     metadata = {"render_modes": []}  # noqa: RUF012 (an instance variable of the base)
 
@@ -33,13 +33,13 @@ class SingleEnv(gymnasium.Env):
         self._state: Any = None  # an EnvState after the first reset
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
-        """A fresh random episode; equal seeds give equal episodes."""
+        """Starts a random episode; equal seeds give equal episodes."""
         super().reset(seed=seed)
         self._state, timestep = self._env.reset(draw_key(self.np_random))
         return np.asarray(timestep.obs[0]), {}
 
     def step(self, action):
-        """`action_repeat` control steps; actions outside [-1, 1] are clipped."""
+        """Takes `action_repeat` control steps; clips the action to [-1, 1]."""
         action = jnp.asarray(action, jnp.float32)[None]
         self._state, timestep = self._env.step(self._state, action)
         obs, reward, terminated, truncated = outcome(timestep)
@@ -49,7 +49,7 @@ class SingleEnv(gymnasium.Env):
 
 
 class BatchedEnv(VectorEnv):
-    """N environments in one compiled call, reset at the step after an episode's last."""
+    """N environments in one compiled call; each resets at the step after its last one."""
 
     metadata = {  # noqa: RUF012
         "render_modes": [],
@@ -65,13 +65,13 @@ class BatchedEnv(VectorEnv):
         self._state: Any = None  # an EnvState after the first reset
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
-        """All environments start an episode; one seed serves them all."""
+        """Starts an episode in all environments, from one seed."""
         super().reset(seed=seed)
         self._state, timestep = self._env.reset(draw_key(self.np_random))
         return np.asarray(timestep.obs), {}
 
     def step(self, actions):
-        """`action_repeat` control steps in each environment."""
+        """Takes `action_repeat` control steps in each environment."""
         self._state, timestep = self._env.step(self._state, jnp.asarray(actions, jnp.float32))
         failed = np.asarray(self._state.steps) < 0
         info = {"physics_failed": failed, "_physics_failed": failed} if failed.any() else {}
@@ -79,12 +79,12 @@ class BatchedEnv(VectorEnv):
 
 
 def compiled(env: Environment) -> Environment:
-    """Jits both functions; the state is donated, so each is used once."""
+    """Jits both functions; `step` donates the state, so each state can be used once."""
     return env._replace(reset=jax.jit(env.reset), step=jax.jit(env.step, donate_argnums=0))
 
 
 def make_spaces(spec: EnvSpec) -> tuple[spaces.Box, spaces.Box]:
-    """Observation and action space of one environment."""
+    """The observation space and the action space of one environment."""
     observation = spaces.Box(-np.inf, np.inf, spec.obs.shape, np.float32)
     return observation, spaces.Box(-1.0, 1.0, (spec.action_size,), np.float32)
 

@@ -1,20 +1,20 @@
-"""A ladder of tiny environments with known values, to find out which part cannot learn.
+"""Tiny environments with known values, from easy to hard, to find the part that cannot learn.
 
     name                        reward r_{t+1} of the action that leaves from o_t
     constant_reward             1
-    truncation                  1, and the episode is cut, not ended: value 1 / (1 - d)
+    truncation                  1, and the episode is truncated: value 1 / (1 - discount)
     discounting                 1 at the last step, else 0
     observation_reward          the signal s_t, a fresh -1 or 1 at every step
     action_reward[_discrete]    the fit of the action to 1
     observation_action[_discrete]  the fit of the action to the signal s_t
     memory[_discrete]           at the last step the fit to the first signal, else 0
 
-An observation is `[signal, clock]`: the signal is 0 where the probe has none (in `memory`
-everywhere but at the first step), the clock runs from 0 to 1 through the episode. The fit
-of a continuous action a in [-1, 1] to c is 1 - 4 (a - c / 2)^2, best at c / 2; a discrete
-one fits with 1 when the second choice is taken for c = 1 and the first for c = -1, and
-with 0 otherwise. Episodes end truly (`is_terminal`) after `episode_length` steps, but for
-`truncation`. Stream convention: see `vawm.envs.protocol`.
+An observation is `[signal, clock]`. The signal is 0 if the probe has none (in `memory`: after
+the first step); the clock runs from 0 to 1 through the episode. The fit of a continuous action
+a in [-1, 1] to c is 1 - 4 (a - c / 2)^2, best at c / 2. The fit of a discrete action is 1 for
+the second choice if c = 1 and for the first if c = -1, otherwise 0. Episodes terminate
+(`is_terminal`) after `episode_length` steps, except in `truncation`. Stream convention: see
+`vawm.envs.protocol`.
 """
 
 from __future__ import annotations
@@ -52,8 +52,8 @@ def make(name: str, *, num_envs: int, episode_length: int = 4) -> Environment:
       episode_length: steps in an episode, T below.
 
     Returns:
-      An `Environment` whose `EnvState` holds the visible signal in `data` and what the
-      action has to fit in `target`, both `[N]`.
+      An `Environment`. Its `EnvState` holds the visible signal in `data`, and in `target`
+      the value c that the action has to fit; both `[N]`.
 
     Raises:
       InvalidInput: an unknown name or an impossible number.
@@ -129,15 +129,15 @@ def known_value(
 ) -> np.ndarray:
     """The optimal value V*(o_t), in closed form, at t = `steps` < T.
 
-        V*(o_t) = max E[sum_{k>=1} discount^{k-1} r_{t+k}], 0 after a true end.
+        V*(o_t) = max E[sum_{k>=1} discount^{k-1} r_{t+k}], 0 after termination.
 
-    Where actions do not matter it is the value of every policy.
+    If actions do not matter, every policy has this value.
 
     Args:
       name: one of `PROBES`.
       steps: `[...]` t, steps since the reset.
       signal: `[...]` visible at t; only `observation_reward` depends on it.
-      discount: in [0, 1), 1 excluded because of `truncation`.
+      discount: in [0, 1); `truncation` excludes 1.
       episode_length: T.
 
     Returns:
@@ -156,14 +156,14 @@ def known_value(
 
 
 def optimal_action(name: str, target: Array) -> Array:
-    """`[N, action_size]` the best action for `EnvState.target`."""
+    """The best action `[N, action_size]` for `EnvState.target`."""
     if name.endswith("discrete"):
         return jax.nn.one_hot((target > 0).astype(jnp.int32), 2)
     return target[:, None] / 2
 
 
 def check_probe(name: str) -> None:
-    """Refuses a name outside `PROBES`, with the nearest one."""
+    """Refuses a name outside `PROBES` and suggests the nearest one."""
     if name in PROBES:
         return
     remedy = f"{suggestion(name, PROBES)}choose one of {', '.join(PROBES)}"
@@ -171,12 +171,12 @@ def check_probe(name: str) -> None:
 
 
 def random_signal(key: Key, num_envs: int) -> Array:
-    """`[N]` of -1 and 1, equally likely."""
+    """`[N]` random signals, -1 or 1 with equal probability."""
     return jax.random.rademacher(key, (num_envs,), jnp.float32)
 
 
 def visible(kind: str, signal: Array, steps: Array) -> Array:
-    """What of the signal the observation shows."""
+    """The part of the signal that the observation shows."""
     if kind in ("observation_reward", "observation_action"):
         return signal
     if kind == "memory":
@@ -185,12 +185,12 @@ def visible(kind: str, signal: Array, steps: Array) -> Array:
 
 
 def wanted(kind: str, signal: Array) -> Array:
-    """What the action has to fit from now on."""
+    """The value c that the action has to fit from now on."""
     return signal if kind in ("observation_action", "memory") else jnp.ones_like(signal)
 
 
 def fit(action: Array, target: Array, discrete: bool) -> Array:
-    """`[N]` how well `[N, A]` actions fit `[N]` targets of -1 or 1; NaN counts as 0."""
+    """The fit `[N]` of actions `[N, A]` to targets `[N]` of -1 or 1; NaN counts as 0."""
     action = jnp.where(jnp.isnan(action), 0.0, action)
     if discrete:
         return jnp.where((action[:, 1] > action[:, 0]) == (target > 0), 1.0, 0.0)
@@ -198,7 +198,7 @@ def fit(action: Array, target: Array, discrete: bool) -> Array:
 
 
 def reward_of(kind: str, state: EnvState, fitness: Array, episode_length: int) -> Array:
-    """`[N]` rewards of the actions that leave from `state`; `fitness` is their fit."""
+    """Rewards `[N]` of the actions that leave from `state`; `fitness` is their fit."""
     last = (state.steps == episode_length - 1).astype(jnp.float32)
     if kind in ("constant_reward", "truncation"):
         return jnp.ones_like(fitness)

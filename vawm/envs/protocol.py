@@ -1,8 +1,9 @@
-"""What every environment of the package looks like: two pure, jittable functions.
+"""The interface of environments: two pure, jittable functions, or a host environment.
 
-Both work on N environments at once; every array leads with `[N]`. The stream follows the
-convention of dm_env: the step *after* `is_last` is a reset. It ignores its action, its
-reward is 0 and it carries `is_first` with the first observation of a new random episode.
+Both functions work on N environments at once; every array leads with `[N]`. The stream
+follows the convention of dm_env: the step *after* `is_last` is a reset. It ignores its
+action, has reward 0 and carries `is_first` with the first observation of a new random
+episode.
 """
 
 from __future__ import annotations
@@ -21,11 +22,11 @@ class EnvState(NamedTuple):
 
     Attributes:
       data: `[N, ...]` batched `mjx.Data`, always finite.
-      target: `[N, G]` what the task randomises outside qpos; G is 0 where nothing is.
+      target: `[N, G]` what the task randomises outside qpos; G is 0 if there is nothing.
       steps: `[N]` int32 control steps since the reset. Negated when the physics failed
         in this episode, so an `is_last` with negative `steps` is a failure, and with
         1000 `steps` an ordinary end.
-      key: `[N]` typed keys for the resets to come.
+      key: `[N]` typed keys for future resets.
     """
 
     data: Any
@@ -39,9 +40,9 @@ class Environment(NamedTuple):
 
     Attributes:
       spec: what an agent has to know; static.
-      reset: `(key) -> (state, TimeStep)`, all N start an episode.
+      reset: `(key) -> (state, TimeStep)`; all N environments start an episode.
       step: `(state, action [N, action_size]) -> (state, TimeStep)`. `state` is an
-        `EnvState` for physics and any NamedTuple with `steps` and `key` elsewhere.
+        `EnvState` for physics, otherwise any NamedTuple with `steps` and `key`.
     """
 
     spec: EnvSpec
@@ -50,47 +51,47 @@ class Environment(NamedTuple):
 
 
 class HostEnvironment(Protocol):
-    """N environments outside of jit, in the same stream; numpy in and out.
+    """N environments outside jit, with the same stream convention; numpy in and out.
 
     Attributes:
       spec: what an agent has to know; static.
-      restarts: environments begun anew after a failure, so far.
+      restarts: number of restarts after a failure so far.
     """
 
     spec: EnvSpec
     restarts: int
 
     def reset(self, seed: int) -> TimeStep:
-        """All N start their first episode."""
+        """Starts the first episode of all N environments."""
 
     def send(self, action: np.ndarray) -> None:
-        """Takes `[N, action_size]` raw actions and returns while they are simulated."""
+        """Starts a step with `[N, action_size]` raw actions, without waiting for it."""
 
     def receive(self) -> TimeStep:
-        """Waits for what `send` began. May raise `EnvironmentFailure`."""
+        """Waits for the step that `send` started. May raise `EnvironmentFailure`."""
 
     def episodes(self) -> Any:
-        """The running episodes: a NamedTuple of arrays, enough to play them again."""
+        """The running episodes: a NamedTuple of arrays, enough to replay them."""
 
     def restore(
         self, seed: int, episodes: Any, expected: TimeStep
     ) -> tuple[TimeStep, np.ndarray]:
-        """Plays `episodes` again; `[N]` bool says which ended in `expected`, bit for bit.
-        The others begin a new episode."""
+        """Replays `episodes`; `[N]` bool says which ended in `expected`, bit for bit.
+        The others start a new episode."""
 
     def close(self) -> None:
-        """Ends it; a second call does nothing."""
+        """Frees everything; a second call does nothing."""
 
 
 class EnvironmentFailure(RuntimeError):
-    """An environment on the host raised, died, hung or returned what no agent can use.
+    """A host environment raised, died, hung or returned a value that no agent can use.
 
     Attributes:
       environment: index among the N.
-      episode: how many episodes it began before this one.
-      step: the action of the episode that failed, from 1; 0 is the reset.
+      episode: number of episodes that it started before this one.
+      step: the step of the episode that failed, from 1; 0 is the reset.
       reason: what happened.
-      traceback: of the process that simulated, where it had one to tell; else "".
+      traceback: of the simulator's process, or "" if it left none.
     """
 
     def __init__(
@@ -103,7 +104,7 @@ class EnvironmentFailure(RuntimeError):
         self.reason = reason
         self.traceback = traceback
         if traceback:
-            self.add_note(f"In the process of the environment:\n{traceback}")
+            self.add_note(f"In the environment's process:\n{traceback}")
 
 
 def check_positive(field: str, value: Any) -> None:

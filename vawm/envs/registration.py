@@ -1,7 +1,8 @@
-"""Gymnasium ids `vawm/<task>-v0`: strings only, what they name is imported by `make`.
+"""Gymnasium ids `vawm/<task>-v0`, as strings: `gymnasium.make` imports what they name.
 
-Gymnasium 1.0 and later look for no plugins: an id is known once the module that registers it
-has been imported. `vawm.envs` does so; `vawm.envs:vawm/<task>-v0` has Gymnasium import it.
+Gymnasium 1.0 and later do not search for plugins: an id is known after the module that
+registers it was imported. `vawm.envs` registers these; with `vawm.envs:vawm/<task>-v0`
+Gymnasium imports it.
 """
 
 from __future__ import annotations
@@ -14,9 +15,9 @@ GRID_WORLD = "vawm/GridWorld-v0"
 
 
 def register(tasks: Iterable[str]) -> None:
-    """Registers the tasks, single and vectorised, and the grid world; once is enough.
+    """Registers the tasks, single and vectorised, and the grid world; a second call is fine.
 
-    Episodes end in the environment itself, so there is no `max_episode_steps` and no
+    The tasks end their episodes themselves, so they have no `max_episode_steps` and no
     TimeLimit wrapper. `action_repeat` is a keyword of `gymnasium.make` and `make_vec`.
     """
     for task in tasks:

@@ -1,4 +1,4 @@
-"""Trained policies: loading them, playing with them, published scores."""
+"""Trained policies: loading, playing, and published scores."""
 
 from vawm.policy.policy import Policy, load
 

@@ -1,8 +1,7 @@
-"""Whole episodes of a trained policy, each of them counted exactly once.
+"""Plays whole episodes of a trained policy, each counted exactly once.
 
-Which episodes there are is fixed before the first begins: one for each environment on the
-device, a share for each on the host. Nobody waits for the first to finish, which would favour
-short episodes.
+The episodes to count are fixed in advance: one per environment on the device, an equal share
+per environment on the host. Counting the first episodes that finish would favour short ones.
 """
 
 from __future__ import annotations
@@ -25,8 +24,8 @@ from vawm.types import Array, Params, PyTree, TimeStep
 How = Literal["sample", "mode"]
 
 FRESH = 2**32
-"""Added to the seed of an evaluation on the host. Seeds of runs are below, so that none of its
-episodes was trained on."""
+"""Added to the seed of an evaluation on the host. Seeds of runs are smaller, so training has
+used none of its episodes."""
 
 
 class Score(NamedTuple):
@@ -68,7 +67,7 @@ class Loop(NamedTuple):
 
 
 def player(env: Environment, policy: Policy, how: How = "sample") -> jax.stages.Wrapped:
-    """`(params, state, key) -> returns`, jitted: one program for every checkpoint of a run."""
+    """`(params, state, key) -> returns`, jitted once for all checkpoints of a run."""
 
     def play(params: Params, state: PyTree, key: Array) -> Array:
         return on_device(env, policy._replace(params=params, state=state), key, how)
@@ -77,7 +76,7 @@ def player(env: Environment, policy: Policy, how: How = "sample") -> jax.stages.
 
 
 def on_device(env: Environment, policy: Policy, key: Array, how: How = "sample") -> Array:
-    """Returns `[N]` of the first episode in each of N environments; can be jitted."""
+    """The return of the first episode in each of N environments, `[N]`; can be jitted."""
     num_envs = env.spec.num_envs
     key_reset, key_act = jax.random.split(key)
 
@@ -109,9 +108,9 @@ def on_device(env: Environment, policy: Policy, key: Array, how: How = "sample")
 def on_host(
     env: HostEnvironment, policy: Policy, *, episodes: int, seed: int, how: How = "sample"
 ) -> Score:
-    """Plays `episodes` whole episodes in N environments, a share in each, begun one by one.
+    """Plays `episodes` whole episodes in N environments, an equal share in each.
 
-    An environment that has played its share goes on, uncounted, until the others have too.
+    An environment that has played its share continues, uncounted, until all are done.
     """
     num_envs = env.spec.num_envs
     share = np.array([len(range(i, episodes, num_envs)) for i in range(num_envs)])
@@ -131,8 +130,8 @@ def on_host(
 
 
 def in_mujoco(policy: Policy, *, episodes: int, seed: int, how: How = "sample") -> Score:
-    """Plays `episodes` of the policy's proprio task in dm_control's own C simulation."""
-    os.environ.setdefault("MUJOCO_GL", "disable")  # nothing is rendered
+    """Plays `episodes` of the policy's proprio task in dm_control's C simulation."""
+    os.environ.setdefault("MUJOCO_GL", "disable")  # no rendering
     from dm_control import suite
 
     domain, task = envs.split(policy.spec.task)
@@ -157,7 +156,7 @@ def in_mujoco(policy: Policy, *, episodes: int, seed: int, how: How = "sample") 
 
 
 def _as_timestep(steps: Sequence[Any], is_first: bool) -> TimeStep:
-    """dm_env's steps of N simulations as one `TimeStep`; entries in dm_control's order."""
+    """Joins dm_env's steps of N simulations; entries are in dm_control's order."""
     obs = [np.concatenate([np.ravel(x) for x in s.observation.values()]) for s in steps]
     last = np.array([step.last() for step in steps])
     return TimeStep(

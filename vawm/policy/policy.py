@@ -1,4 +1,4 @@
-"""A trained agent, ready to act: what `vawm.load` returns."""
+"""A trained policy, ready to act: what `vawm.load` returns."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vawm.config import Config
 from vawm.policy import weights
 from vawm.policy.weights import Description
 from vawm.runs import budget, checkpoint, validate
-from vawm.runs.checkpoint import manifest as manifest_lib
+from vawm.runs.checkpoint import manifest
 from vawm.runs.checkpoint.manifest import Manifest
 from vawm.types import Array, EnvSpec, Key, Params, PyTree, TimeStep
 
@@ -23,14 +23,14 @@ log = logging.getLogger("vawm")
 
 
 class Policy(NamedTuple):
-    """A checkpoint of a run, the newest that is whole, without what only training needs.
+    """A trained policy: the parameters of a checkpoint, without what only training needs.
 
     Attributes:
       config: of the run.
       spec: of the environment it was trained in.
-      env_steps: when the checkpoint was written.
+      env_steps: at which the checkpoint was written.
       params: the parameters.
-      state: what the world model carries beside them.
+      state: the world model's state besides its parameters.
       initial: `(batch_size) -> carry`, before the first observation.
       apply: `(params, state, key, carry, timestep, *, how) -> (carry, action [N, A])`,
         jitted and pure.
@@ -56,10 +56,10 @@ class Policy(NamedTuple):
 
 
 def load(logdir: str | os.PathLike[str]) -> Policy:
-    """The policy in `logdir`, of a run or as `vawm.export` wrote it; nothing else is read.
+    """Loads the policy in `logdir`, the folder of a run or one that `vawm.export` wrote.
 
-    Where that is damaged, the newest older one that is whole is loaded, and the log of `vawm`
-    says so.
+    Of a run, it loads the newest undamaged checkpoint and reads nothing else. It warns in the
+    log `vawm` if a newer one is damaged.
 
     Raises:
       InvalidInput: there is no checkpoint, or all are damaged.
@@ -67,16 +67,15 @@ def load(logdir: str | os.PathLike[str]) -> Policy:
     if weights.found(logdir):
         return import_policy(logdir)
     found = checkpoint.usable(logdir, checkpoint.ACTING)
-    manifest = found.manifest
-    validate.check_spec(manifest.config, manifest.spec)
-    return _policy(manifest, functools.partial(checkpoint.read_agent, found))
+    validate.check_spec(found.manifest.config, found.manifest.spec)
+    return _policy(found.manifest, functools.partial(checkpoint.read_agent, found))
 
 
 def import_policy(folder: str | os.PathLike[str]) -> Policy:
-    """The policy that `vawm.export` wrote to `folder`, bit for bit that of the checkpoint.
+    """Loads the policy that `vawm.export` wrote to `folder`, bit-identical to its checkpoint.
 
     Raises:
-      InvalidInput: a file is missing or damaged, or the weights are not those of its config.
+      InvalidInput: a file is missing or damaged, or the weights do not fit the config.
     """
     description = weights.describe(folder)
     return _policy(description, functools.partial(weights.read, folder, description))
@@ -85,16 +84,17 @@ def import_policy(folder: str | os.PathLike[str]) -> Policy:
 def _policy(
     of: Manifest | Description, read: Callable[[PyTree, PyTree], tuple[PyTree, PyTree]]
 ) -> Policy:
-    """The policy that `of` describes; `read` fills shapes of parameters and state.
+    """Builds the policy that `of` describes; `read` loads parameters and state of given shapes.
 
     Raises:
-      InvalidInput: it does not fit into memory.
+      InvalidInput: the policy does not fit into memory.
     """
-    if of.version != manifest_lib.version():
+    if of.version != manifest.version():
         log.warning(
-            "vawm %s trained this policy and this is vawm %s: that it acts the same is not "
-            "promised",
-            *(of.version, manifest_lib.version()),
+            "this policy was trained with vawm %s and loaded with vawm %s: it may act "
+            "differently",
+            of.version,
+            manifest.version(),
         )
     agent = make_agent(of.config, of.spec)
     shapes = jax.eval_shape(agent.init, jax.random.key(0))

@@ -1,12 +1,12 @@
-"""A policy's weights in a folder of three plain files, to be shared and loaded anywhere.
+"""A policy's weights in a folder of three plain files, to share and load anywhere.
 
-    model.safetensors   all parameters, and what the world model carries beside them
+    model.safetensors   all parameters, and the world model's state besides them
     config.json         config, environment spec, version, SHA-256 of model.safetensors
     README.md           a model card, for people only
 
-Names are paths in the tree, such as `params.actor['layer_0']['kernel']`; dtypes stay as they
-are. Nothing is pickled. What is read is compared with what the config builds, by name, shape
-and dtype, before any array is allocated, and with its checksum.
+Names are paths in the tree, such as `params.actor['layer_0']['kernel']`; dtypes are kept.
+Nothing is pickled. Before any array is allocated, the file is compared by name, shape and dtype
+with what the config builds, and then with its checksum.
 """
 
 from __future__ import annotations
@@ -24,11 +24,10 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
-from vawm import config as config_lib
-from vawm.config import Config
+from vawm.config import Config, as_dict
 from vawm.errors import InvalidInput
 from vawm.runs import checkpoint, run_folder, validate
-from vawm.runs.checkpoint import manifest as manifest_lib
+from vawm.runs.checkpoint import manifest
 from vawm.runs.checkpoint.manifest import LeafInfo
 from vawm.types import EnvSpec, Params, PyTree
 
@@ -49,20 +48,20 @@ DTYPES = {
     "F32": "float32",
     "F64": "float64",
 }
-"""What safetensors calls a dtype -> what numpy does."""
+"""safetensors' name of a dtype -> numpy's name."""
 MAX_BYTES = 2**24
-"""Of `config.json`; that of a policy has a few thousand."""
+"""Limit for `config.json`; usually it has a few thousand bytes."""
 
 
 WRONG = (
     *(OSError, ValueError, TypeError, KeyError, AttributeError),
-    *(OverflowError, RecursionError),  # numbers without end, and nesting
+    *(OverflowError, RecursionError),  # from huge numbers and deep nesting
 )
-"""What is raised by content that is no description."""
+"""Exceptions that a `config.json` with wrong content raises."""
 
 
 class Description(NamedTuple):
-    """What `config.json` says of the weights beside it.
+    """The content of `config.json`, which describes the weights next to it.
 
     Attributes:
       version: of the package that wrote it.
@@ -80,9 +79,9 @@ class Description(NamedTuple):
 
 
 def found(folder: str | os.PathLike[str]) -> bool:
-    """Whether `folder` is, or was, one that `write` wrote, and not that of a run."""
+    """Whether `write` wrote `folder`, even if it is damaged now; False for that of a run."""
     folder = pathlib.Path(folder).expanduser()
-    if os.path.isfile(folder / MODEL):  # False too where it may not be looked at
+    if os.path.isfile(folder / MODEL):  # False as well without permission to look
         return True
     try:
         return bool(_content(folder / CONFIG))
@@ -91,14 +90,14 @@ def found(folder: str | os.PathLike[str]) -> bool:
 
 
 def check_output(folder: pathlib.Path) -> None:
-    """Refuses a place where nothing can be written, or where something is.
+    """Refuses a folder that is not writable or not empty; writes nothing.
 
     Raises:
-      InvalidInput: nothing was written.
+      InvalidInput: it is not writable or not empty.
     """
     run_folder.check_writable(folder.parent, "output")
     if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
-        raise InvalidInput("output", str(folder), "exists; choose another --output")
+        raise InvalidInput("output", str(folder), "already exists; choose another --output")
 
 
 def write(
@@ -111,11 +110,11 @@ def write(
     env_steps: int,
     card: str,
 ) -> None:
-    """Writes the three files under a temporary name, which becomes `folder` at the end.
+    """Writes the three files to a temporary folder, then renames it to `folder`.
 
     Raises:
       InvalidInput: `folder` exists and is not empty, or `read` would refuse the config.
-      SaveError: the disk is full; nothing is left behind.
+      SaveError: writing failed, for example on a full disk; leaves no files behind.
     """
     check_output(folder)
     validate.check(config)
@@ -125,20 +124,20 @@ def write(
     content = {
         "format": FORMAT,
         "schema": SCHEMA,
-        "vawm": manifest_lib.version(),
+        "vawm": manifest.version(),
         "env_steps": env_steps,
-        "config": config_lib.as_dict(config),
-        "spec": manifest_lib.spec_as_dict(spec),
+        "config": as_dict(config),
+        "spec": manifest.spec_as_dict(spec),
     }
     try:
         scratch.mkdir(parents=True)
         safetensors.numpy.save_file(leaves, scratch / MODEL, metadata={"format": "np"})
-        content["sha256"] = manifest_lib.sha256(scratch / MODEL)
+        content["sha256"] = manifest.sha256(scratch / MODEL)
         (scratch / CONFIG).write_text(json.dumps(content, indent=2) + "\n")
         (scratch / CARD).write_text(card)
-        (scratch / MODEL).chmod((scratch / CARD).stat().st_mode)  # the library's is 0600
+        (scratch / MODEL).chmod((scratch / CARD).stat().st_mode)  # safetensors sets 0600
         for path in (*scratch.iterdir(), scratch):
-            manifest_lib.sync(path)
+            manifest.sync(path)
         scratch.replace(folder.absolute())
     except (OSError, safetensors.SafetensorError) as error:
         shutil.rmtree(scratch, ignore_errors=True)
@@ -146,7 +145,7 @@ def write(
 
 
 def describe(folder: str | os.PathLike[str]) -> Description:
-    """What `config.json` in `folder` says.
+    """Reads and checks `config.json` in `folder`.
 
     Raises:
       InvalidInput: it is damaged, or another version wrote it (`OtherVersion`).
@@ -156,28 +155,28 @@ def describe(folder: str | os.PathLike[str]) -> Description:
         content = _content(path)
         written = content["vawm"]
         if content["schema"] != SCHEMA:
-            raise InvalidInput("schema", content["schema"], "its layout is not known")
+            raise InvalidInput("schema", content["schema"], "is unknown to this version")
         description = Description(
             version=str(written),
             env_steps=int(content["env_steps"]),
-            config=manifest_lib.config_from_dict(content["config"]),
-            spec=manifest_lib.spec_from_dict(content["spec"]),
+            config=manifest.config_from_dict(content["config"]),
+            spec=manifest.spec_from_dict(content["spec"]),
             sha256=content["sha256"],
         )
         validate.check(description.config)
         validate.check_spec(description.config, description.spec)
         return description
     except InvalidInput as error:
-        raise manifest_lib.OtherVersion(
+        raise manifest.OtherVersion(
             "weights", path, error, written=written, otherwise="export it again"
         ) from error
     except WRONG as error:
         reason = error.strerror if isinstance(error, OSError) else repr(error)[:200]
-        raise _damaged(path, f"is no description of a policy ({reason})") from error
+        raise _damaged(path, f"does not describe a policy ({reason})") from error
 
 
 def _content(path: pathlib.Path) -> dict[str, Any]:
-    """What is in `config.json`, of this format; an error of `WRONG` where it is none."""
+    """The content of `config.json`; raises one of `WRONG` if it has another format."""
     with path.open("rb") as file:
         text = file.read(MAX_BYTES + 1)
     if len(text) > MAX_BYTES:
@@ -191,20 +190,22 @@ def _content(path: pathlib.Path) -> dict[str, Any]:
 def read(
     folder: str | os.PathLike[str], description: Description, params: PyTree, state: PyTree
 ) -> tuple[PyTree, PyTree]:
-    """The weights in `folder`, like the two trees given (arrays or `ShapeDtypeStruct`s).
+    """Reads the weights in `folder` into trees like those given.
+
+    `params` and `state` may hold arrays or `ShapeDtypeStruct`s.
 
     Raises:
       InvalidInput: a name, shape or dtype differs, or the file is damaged.
     """
     path = pathlib.Path(folder).expanduser() / MODEL
     expected = _flatten(params, state)
-    infos = {name: manifest_lib.leaf_info(leaf) for name, leaf in expected.items()}
+    infos = {name: manifest.leaf_info(leaf) for name, leaf in expected.items()}
     try:
         with safetensors.safe_open(path, framework="numpy") as file:
             slices = {name: file.get_slice(name) for name in file.keys()}  # noqa: SIM118
             stored = {name: _info(entry) for name, entry in slices.items()}
             _compare(path, stored, infos)
-            if manifest_lib.sha256(path) != description.sha256:
+            if manifest.sha256(path) != description.sha256:
                 raise _damaged(path, f"does not match its checksum in {CONFIG}")
             leaves = {name: jnp.array(file.get_tensor(name)) for name in expected}
     except (OSError, safetensors.SafetensorError) as error:
@@ -241,11 +242,9 @@ def _compare(
     ]
     if differences:
         more = f"; and {len(differences) - 3} more" if len(differences) > 3 else ""
-        remedy = f"{'; '.join(differences[:3])}{more}: these are not weights of {CONFIG}"
-        raise InvalidInput("weights", str(path), remedy)
+        wrong = f"the weights do not fit {CONFIG}: {'; '.join(differences[:3])}{more}"
+        raise InvalidInput("weights", str(path), f"{wrong}; export the policy again")
 
 
 def _damaged(path: pathlib.Path, how: str) -> InvalidInput:
-    return InvalidInput(
-        "weights", str(path), f"{how}; export the policy again, or copy it again"
-    )
+    return InvalidInput("weights", str(path), f"{how}; export or copy the policy again")

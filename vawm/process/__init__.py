@@ -1,1 +1,1 @@
-"""The process a program runs in: compilation cache, memory pages, signals, standard output."""
+"""The process of a program: compilation cache, memory pages, signals, standard output."""

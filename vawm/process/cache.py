@@ -1,4 +1,4 @@
-"""JAX's persistent compilation cache, on by default: the second start compiles nothing.
+"""JAX's persistent compilation cache, on by default, so the second start compiles nothing.
 
 The folder is `$JAX_COMPILATION_CACHE_DIR`, else `$XDG_CACHE_HOME/vawm/jax`, else
 `~/.cache/vawm/jax`; `VAWM_NO_CACHE=1` switches the cache off.
@@ -16,7 +16,7 @@ MIN_COMPILE_SECONDS = 0.5
 
 
 def folder() -> pathlib.Path:
-    """Where compiled functions are kept."""
+    """The folder of compiled functions."""
     explicit = os.environ.get("JAX_COMPILATION_CACHE_DIR")
     if explicit:
         return pathlib.Path(explicit).expanduser()
@@ -25,10 +25,10 @@ def folder() -> pathlib.Path:
 
 
 def enable() -> pathlib.Path | None:
-    """Turns the cache on; a folder that cannot be written leaves it off, with a warning.
+    """Turns the cache on. Warns and leaves it off if its folder cannot be written.
 
     Returns:
-      The folder in use, or None where the cache is off.
+      The folder in use, or None if the cache is off.
     """
     if os.environ.get("VAWM_NO_CACHE", "") not in ("", "0"):
         jax.config.update("jax_enable_compilation_cache", False)
@@ -39,7 +39,7 @@ def enable() -> pathlib.Path | None:
         if not os.access(path, os.W_OK | os.X_OK):
             raise PermissionError(f"{path} is not writable")
     except (OSError, RuntimeError) as error:  # RuntimeError: no home to expand "~" to
-        remedy = "set JAX_COMPILATION_CACHE_DIR to a folder that can be written"
+        remedy = "set JAX_COMPILATION_CACHE_DIR to a writable folder"
         print(f"warning: no compilation cache ({error}); {remedy}", file=sys.stderr)
         return None
     jax.config.update("jax_compilation_cache_dir", str(path))

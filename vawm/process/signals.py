@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM and SIGHUP: the first asks a run to stop in order, a later one ends it."""
+"""Ctrl-C, SIGTERM and SIGHUP: the first stops a run cleanly, a later one kills it."""
 
 from __future__ import annotations
 
@@ -10,33 +10,35 @@ import time
 from collections.abc import Callable, Iterator
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-"""What asks a run to stop: its user, a scheduler, a terminal or a connection that closes."""
+"""Sent by the user, by a scheduler, or when a terminal or a connection closes."""
 BURST_SECONDS = 1.0
-"""Signals so close together are one: `timeout` sends two, a terminal one to each process."""
+"""Signals this close together count as one: `timeout` sends two, a terminal signals every
+process."""
 
 
 class Stop:
-    """`signal` is the number of the signal that asked for the end, or None."""
+    """`signal` is the number of the signal that asked the run to stop, or None."""
 
     signal: int | None = None
 
     @property
     def exit_code(self) -> int:
-        """What a shell expects of a process that a signal ended; 0 without one."""
+        """The shell's exit code for a process ended by `signal`; 0 without one."""
         return 0 if self.signal is None else 128 + self.signal
 
 
 @contextlib.contextmanager
 def catch(notify: Callable[[], None] = lambda: None) -> Iterator[Stop]:
-    """Turns the first signal into a request, and lets a later one end the process at once.
+    """Turns the first signal into a request; a later one ends the process at once.
 
-    A thread hears of signals through a pipe, because Python runs its own handlers only
-    between two calls of compiled code, which can be minutes apart. Outside the main
-    thread signals cannot be caught, and nothing is. SIGHUP stays ignored where it is, as
-    under `nohup`; SIGINT does not, which a script ignores for all that it starts with `&`.
+    A thread reads signals from a pipe, because Python runs its own handlers only between
+    two calls of compiled code, which can be minutes apart. Python can catch signals only in
+    the main thread; elsewhere this does nothing. SIGHUP stays ignored if it is already, as
+    under `nohup`. SIGINT is caught even if it is ignored, because scripts ignore it for
+    everything they start with `&`.
 
     Args:
-      notify: called at the first signal, in that thread.
+      notify: called at the first signal, in the thread that reads signals.
     """
     stop, asked = Stop(), 0.0
     ignored = signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
@@ -54,7 +56,7 @@ def catch(notify: Callable[[], None] = lambda: None) -> Iterator[Stop]:
                 continue
             if stop.signal is None:
                 stop.signal, asked = received[0], time.monotonic()
-                with contextlib.suppress(BaseException):  # a closed terminal takes no line
+                with contextlib.suppress(BaseException):  # the terminal may be closed
                     notify()
             elif time.monotonic() - asked > BURST_SECONDS:
                 os._exit(128 + received[0])

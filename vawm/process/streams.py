@@ -1,7 +1,7 @@
-"""Standard output and standard error that a process outlives.
+"""Lets a process survive the loss of its standard output and standard error.
 
-A pipe whose reader ended, a terminal that was closed, a file on a disk that is full: none of
-them is a reason to lose a run, whose metrics are in its folder.
+A run must not fail because the reader of a pipe ended, a terminal was closed or a disk is
+full: its metrics are in its folder.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from typing import IO, Any
 
 
 class Lasting:
-    """A text file that takes what it is given; once it cannot write, it drops it.
+    """A text file that drops all text once a write has failed.
 
-    The first time it says so on standard error, as far as that can be heard. What is written
-    past it, to `buffer` or `fileno()`, is not its business.
+    Prints one warning to standard error, if that still works. Writes to `buffer` or
+    `fileno()` are not covered.
     """
 
     def __init__(self, file: IO[str], name: str):
@@ -37,7 +37,7 @@ class Lasting:
         self._try(self._file.flush)
 
     def finish(self) -> None:
-        """Flushes, or loses what cannot be: Python's own flush at exit would cost the code."""
+        """Flushes, or drops the rest: a failing flush at exit would change the exit code."""
         self._try(self._file.flush, last=True)
 
     def _try(self, call: Callable[..., object], *arguments: str, last: bool = False) -> None:
@@ -48,7 +48,7 @@ class Lasting:
         except UnicodeError:
             raise
         except (OSError, ValueError) as error:  # ValueError: it was closed
-            # A pipe that is full for the moment has lost this text alone.
+            # BlockingIOError: the pipe is full right now, so only this text is lost.
             if last or not isinstance(error, BlockingIOError):
                 self._lose(error)
 
@@ -60,25 +60,29 @@ class Lasting:
         with contextlib.suppress(OSError, ValueError):
             if (number := self._file.fileno()) in (1, 2):
                 nowhere = os.open(os.devnull, os.O_WRONLY)
-                os.dup2(nowhere, number)  # where Python flushes what is left, at exit
+                os.dup2(nowhere, number)  # Python flushes the rest there at exit
                 os.close(nowhere)
         why = error.strerror if isinstance(error, OSError) else error
         with contextlib.suppress(OSError, ValueError):
-            print(f"warning: {self._name} is gone ({why})", file=sys.stderr, flush=True)
+            message = f"warning: {self._name} is closed ({why}); its further text is dropped"
+            print(message, file=sys.stderr, flush=True)
 
     def isatty(self) -> bool:
         return not self._gone and self._file.isatty()
 
     def __getattr__(self, name: str) -> Any:
-        if name.startswith("_"):  # while it is being copied it has none of its own
+        if name.startswith("_"):  # while being copied, it has no attributes yet
             raise AttributeError(name)
         return getattr(self._file, name)
 
 
 @contextlib.contextmanager
 def outlive() -> Iterator[None]:
-    """Inside, `sys.stdout` and `sys.stderr` are `Lasting`. One that was closed before the
-    process began takes everything, and its number does not go to the next file."""
+    """Makes `sys.stdout` and `sys.stderr` `Lasting` inside the `with` block.
+
+    If one was closed before the process started, text written to it is dropped, and its file
+    descriptor is kept from the next file that is opened.
+    """
     _open_closed()
     before = sys.stdout, sys.stderr
     ours = tuple(map(_lasting, before, ("standard output", "standard error")))
@@ -86,7 +90,7 @@ def outlive() -> Iterator[None]:
     try:
         yield
     finally:
-        # Unless someone put another one in its place: inside, or in another thread.
+        # Unless other code replaced it, inside the block or in another thread.
         if sys.stdout is ours[0]:
             sys.stdout = before[0]
         if sys.stderr is ours[1]:
@@ -102,7 +106,7 @@ def _lasting(file: IO[str] | None, name: str) -> Any:
 
 
 def _open_closed() -> None:
-    """Gives the numbers 0 to 2 to nothing, where they are free."""
+    """Opens the null device on each of the descriptors 0 to 2 that is free."""
     while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
         os.set_inheritable(number, True)
     os.close(number)

@@ -1,1 +1,1 @@
-"""Runs on disk: what may run, the loop, checkpoints, resuming, reports."""
+"""Runs on disk: validation, the loop, checkpoints, resuming, reports."""

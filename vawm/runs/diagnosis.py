@@ -1,4 +1,4 @@
-"""What is known of a run whose loss is not finite, for whoever looks for the reason."""
+"""Finds the cause of losses that are not finite, and writes it to `diagnosis.json`."""
 
 from __future__ import annotations
 
@@ -24,8 +24,10 @@ FILE = "diagnosis.json"
 
 
 def first_nonfinite(metrics: Mapping[str, Any]) -> str | None:
-    """The name of the first loss of a chunk that is not finite; None if all are, or it had
-    no update."""
+    """The name of a chunk's first loss that is not finite.
+
+    None if all losses are finite or the chunk had no update.
+    """
     if not int(metrics["chunk/updates"]):
         return None
     losses = (name for name in metrics if name.startswith("loss/"))
@@ -37,10 +39,10 @@ def write(
 ) -> pathlib.Path:
     """Writes `diagnosis.json` about the chunk that led to `state` and measured `metrics`.
 
-    It names the loss and its value, env steps and updates, the optimiser's choices, every
-    metric of the chunk that is not finite, the last line of metrics whose losses are all
-    finite, the parameters that are not finite, and what replay holds that is not, or waits
-    to be stored: that came from the environments, or from the policy.
+    It has the loss and its value, env steps and updates, the optimiser's choices, the last
+    line of metrics with finite losses, and everything that is not finite: metrics of the
+    chunk, parameters, and steps in replay or not yet stored, which came from the
+    environments or from the policy.
 
     Raises:
       OSError: it cannot be written.
@@ -64,16 +66,16 @@ def write(
 
 
 def reason(state: TrainState, metrics: Mapping[str, Any], *, last: bool) -> str | None:
-    """Why a run cannot go on after the chunk that led to `state`; None if it can.
+    """Why a run must stop after the chunk that led to `state`; None if it can continue.
 
-    What an environment returned or was sent and is not finite: it would be saved with replay,
-    and be learned from one day. A loss; after the `last` chunk also a parameter: no loss of a
-    next update would tell.
+    It must stop if a value from an environment or an action is not finite, because training
+    would later read it from replay; if a loss is not finite; and, after the `last` chunk, if
+    a parameter is not finite, because no later loss would show it.
     """
     if int(metrics["chunk/nonfinite"]):
         first = _first(nonfinite_steps(state))
         acted = first is not None and _is_action(first)
-        return f"{'an action' if acted else 'what an environment returned'} is not finite"
+        return f"{'an action' if acted else 'a value from an environment'} is not finite"
     if loss := first_nonfinite(metrics):
         return f"{loss} is {float(metrics[loss])}"
     if last and (params := nonfinite_parameters(state)):
@@ -82,27 +84,28 @@ def reason(state: TrainState, metrics: Mapping[str, Any], *, last: bool) -> str 
 
 
 def nonfinite_parameters(state: TrainState) -> list[str]:
-    """Paths of the parameters that are not finite, and of the world model's own state."""
+    """Paths of the parameters, and of the world model's state, that are not finite."""
     learner = state.learner
     leaves = checkpoint.flatten(learner.params) | checkpoint.flatten(learner.model_state)
     return [name for name, x in leaves.items() if not _is_finite(x)]
 
 
 def last_finite_line(logdir: pathlib.Path) -> Line | None:
-    """The last line of metrics that has losses, all of them finite."""
+    """The last line of metrics with losses that are all finite."""
     for line in reversed(tracking.read(logdir / METRICS)):
         losses = [value for name, value in line.items() if name.startswith("loss/")]
-        if losses and None not in losses:  # null is what is not finite
+        if losses and None not in losses:  # None: not finite
             return line
     return None
 
 
 def nonfinite_steps(state: TrainState) -> list[dict[str, Any]]:
-    """Per field of the trajectory where it is not finite: in which environment first, how many
-    steps of that environment ago, and in how many steps of all.
+    """The fields of the trajectory that are not finite, one entry each.
 
-    Counted back from the newest step in replay, which is 0 steps ago; what has arrived since
-    and waits to be stored is -1 steps ago. One reduction to `[N, C]` each.
+    An entry has the environment with the oldest such step, the age of that step in steps of
+    that environment, and the number of such steps in all environments. The newest step in
+    replay is 0 steps ago; one that waits to be stored is -1 steps ago. Costs one reduction
+    to `[N, C]` per field.
     """
     replay = state.replay
     capacity = replay.trajectory.reward.shape[1]
@@ -115,7 +118,7 @@ def nonfinite_steps(state: TrainState) -> list[dict[str, Any]]:
 
 
 def _nonfinite(steps: PyTree, ago: np.ndarray) -> Iterator[dict[str, Any]]:
-    """An entry for every field of `steps`, `[N, C, ...]`, of which `ago` is the age, `[C]`."""
+    """Entries for the fields of `steps` `[N, C, ...]`, whose age is `ago` `[C]`."""
     for name, leaf in checkpoint.flatten(steps).items():
         if not jnp.issubdtype(leaf.dtype, jnp.floating) or not leaf.size:
             continue
@@ -132,23 +135,23 @@ def _nonfinite(steps: PyTree, ago: np.ndarray) -> Iterator[dict[str, Any]]:
 
 
 def advice(state: TrainState) -> str:
-    """What to do about a run that has come to `state`, in one sentence."""
+    """One sentence on what to do about a run that stopped at `state`."""
     first = _first(nonfinite_steps(state))
     if first is None or _is_action(first):
         return "Start again with a smaller --optimizer.learning-rate or another --seed"
     ago = f"{first['steps_ago'] + 1} steps before the newest"
-    return f"{where(first)}, {ago}: mend what returned it, then go on with --resume"
+    return f"{where(first)}, {ago}; fix the environment, then continue with --resume"
 
 
 def where(found: Mapping[str, Any]) -> str:
-    """An entry of `nonfinite_steps`, in words."""
+    """Describes an entry of `nonfinite_steps`."""
     if _is_action(found):
         return f"an action of environment {found['environment']} is not finite"
-    return f"environment {found['environment']} returned {found['field']} that is not finite"
+    return f"{found['field']} from environment {found['environment']} is not finite"
 
 
 def _first(found: list[dict[str, Any]]) -> dict[str, Any] | None:
-    """The first of `nonfinite_steps`: the cause of the others. Actions follow what they see."""
+    """The oldest of `nonfinite_steps`, the likely cause; observations come before actions."""
     return max(found, key=lambda x: (x["steps_ago"], not _is_action(x)), default=None)
 
 

@@ -1,4 +1,4 @@
-"""Continuing a run: the same choices, the same state, perhaps more steps."""
+"""Resumes a run: the same choices, the same state, possibly more steps."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from vawm.config import CUSTOM, Config
 from vawm.errors import InvalidInput
 from vawm.learning.replay import Replay
 from vawm.runs import checkpoint, run_folder, validate
-from vawm.runs.checkpoint import manifest as manifest_lib
-from vawm.runs.checkpoint.manifest import Manifest
+from vawm.runs.checkpoint import manifest
+from vawm.runs.checkpoint.manifest import Manifest, OtherVersion
 from vawm.runs.reports import tracking
 from vawm.types import PyTree
 
@@ -25,14 +25,14 @@ MAY_DIFFER = (
     *("env.workers", "env.timeout", "env.on_failure"),
     *("tracker", "tracker_project"),
 )
-"""What changes neither what a run learns nor what it has stored."""
+"""Fields that may differ: they change neither what a run learns nor what it has stored."""
 
 
 def saved_config(logdir: str | os.PathLike[str]) -> Config:
-    """The choices of the run in `logdir`: of its newest checkpoint, or as it was started.
+    """The config of the run in `logdir`, from its newest checkpoint or from its start.
 
     Raises:
-      InvalidInput: the folder is not that of a run, or its checkpoints are damaged.
+      InvalidInput: `logdir` is not the folder of a run, or its checkpoints are damaged.
     """
     if checkpoint.latest(logdir) is None:
         started = run_folder.read_config(pathlib.Path(logdir).expanduser())
@@ -42,11 +42,11 @@ def saved_config(logdir: str | os.PathLike[str]) -> Config:
 
 
 def check(logdir: str | os.PathLike[str], config: Config) -> None:
-    """Whether the run in `logdir` can be continued as `config`.
+    """Refuses to resume the run in `logdir` with `config` if that cannot work.
 
     Raises:
-      InvalidInput: there is none, its checkpoints are gone, another version wrote them, a
-        choice differs, or there is nothing left to do.
+      InvalidInput: there is no run, its checkpoints are missing, another version wrote
+        them, a choice differs, or the run is already complete.
     """
     started = saved_config(logdir)
     path = checkpoint.latest(logdir)
@@ -56,7 +56,7 @@ def check(logdir: str | os.PathLike[str], config: Config) -> None:
         _refuse_another_version(checkpoint.find(logdir, ()))
     saved = dict(validate.values(started))
     choices = list(validate.values(config))
-    if config.size == CUSTOM:  # the width that differs says more, so its name comes last
+    if config.size == CUSTOM:  # check size last, to name the width that differs instead
         choices.sort(key=lambda choice: choice[0] == "size")
     whose = "the checkpoint was trained" if path else "the run was started"
     for name, value in choices:
@@ -64,32 +64,34 @@ def check(logdir: str | os.PathLike[str], config: Config) -> None:
             remedy = f"{whose} with {saved[name]!r}; use that to resume"
             raise InvalidInput(name, value, remedy)
     if path and config.env_steps <= int(path.name):
-        # It is as far as it should be; unless that checkpoint is damaged.
+        # The run is complete, unless its newest checkpoint is damaged.
         done = checkpoint.find(logdir).manifest.env_steps
         if config.env_steps > done:
             return
-        remedy = f"the checkpoint is at {done} already; use more to continue it"
+        remedy = f"the checkpoint is already at {done}; use a larger number to continue"
         raise InvalidInput("env_steps", config.env_steps, remedy)
 
 
 def _refuse_another_version(found: checkpoint.Found) -> None:
-    """Refuses to go on with what another version began, though it could be read.
+    """Refuses to resume a run of another version, even if it can be read.
 
     Raises:
-      OtherVersion: a version may compute otherwise, and no metric would tell.
+      OtherVersion: versions may compute differently, and no metric would show it.
     """
     written = found.manifest.version
-    if written != manifest_lib.version():
-        why = "a run goes on with the version that began it"
-        raise manifest_lib.OtherVersion("checkpoint", found.path, why, written=written)
+    if written != manifest.version():
+        why = "a run must be resumed with the version that started it"
+        raise OtherVersion("checkpoint", found.path, why, written=written)
 
 
 def _refuse_to_lose(logdir: str | os.PathLike[str], started: Config) -> None:
-    """Refuses to start a run over, and its metrics, if it should have saved a checkpoint.
+    """Refuses to restart a run without checkpoints if it should have saved one.
+
+    Restarting would delete its metrics.
 
     Raises:
-      InvalidInput: a line tells of a checkpoint, or its metrics reach the first one that was
-        due by its steps.
+      InvalidInput: a line records a checkpoint, or the metrics reach the env steps of the
+        first one.
     """
     folder = pathlib.Path(logdir).expanduser()
     saves = tracking.read(folder / tracking.SAVE_LINES)
@@ -98,25 +100,25 @@ def _refuse_to_lose(logdir: str | os.PathLike[str], started: Config) -> None:
     if not saves and reached < min(started.save_every, started.env_steps):
         return
     remedy = (
-        f"its checkpoints are gone or were never written, and starting over would lose the "
-        f"metrics of {reached} env steps; choose another --logdir, or start over with --fresh"
+        f"has no checkpoints, but metrics of {reached} env steps; choose another --logdir, or "
+        "start over with --fresh, which keeps the old files in a subfolder"
     )
     raise InvalidInput("logdir", str(logdir), remedy)
 
 
 def cut_back(logdir: str | os.PathLike[str], *, env_steps: int, logged: int) -> str | None:
-    """Drops the lines of what a run that goes on from `env_steps` will do again.
+    """Drops the lines that a run resumed at `env_steps` will write again.
 
     Args:
-      logdir: its folder.
+      logdir: folder of the run.
       env_steps: of the checkpoint.
-      logged: env steps of the last line of metrics that was written before it.
+      logged: env steps of the last line of metrics before the checkpoint.
 
     Returns:
-      A line about metrics that are missing among those that stay; None without any.
+      A warning about missing or damaged lines among the earlier ones, or None.
 
     Raises:
-      OSError: a file cannot be written; it is as it was.
+      OSError: a file cannot be written; it is unchanged.
     """
     folder = pathlib.Path(logdir).expanduser()
     damaged = tracking.truncate(folder / tracking.METRICS, logged)
@@ -126,22 +128,22 @@ def cut_back(logdir: str | os.PathLike[str], *, env_steps: int, logged: int) -> 
     reached = lines[-1]["env_steps"] if lines else 0
     if reached < logged:
         return (
-            f"{tracking.METRICS} ends at {reached} env steps and the checkpoint goes on from "
-            f"{logged}: the lines between are lost"
+            f"{tracking.METRICS} ends at {reached} env steps, but the checkpoint continues "
+            f"from {logged}: the lines in between are lost"
         )
     if damaged:
-        return f"{damaged} damaged lines of {tracking.METRICS} are left out"
+        return f"dropped {damaged} damaged lines of {tracking.METRICS}"
     return None
 
 
 class Restored(NamedTuple):
-    """What a run goes on from.
+    """The content of the checkpoint that a run resumes from.
 
     Attributes:
       state: the `TrainState`.
-      episodes: what environments on the host did since their last reset; None without any.
+      episodes: the running episodes of environments on the host, or None.
       manifest: of the checkpoint.
-      warning: a line about newer checkpoints, which are damaged and were set aside.
+      warning: a line about newer checkpoints that are damaged and were renamed, or None.
     """
 
     state: PyTree
@@ -151,13 +153,13 @@ class Restored(NamedTuple):
 
 
 def restore(logdir: str | os.PathLike[str], shapes: PyTree) -> Restored:
-    """The newest whole checkpoint; `shapes` is what the run would start with otherwise.
+    """Reads the newest undamaged checkpoint; `shapes` are those of the run's initial state.
 
-    A run that is extended may want a larger replay than was saved: it is grown. Newer
-    checkpoints that are damaged are renamed.
+    If an extended run needs a larger replay than was saved, the replay grows. Renames newer
+    checkpoints, which are damaged.
 
     Raises:
-      InvalidInput: all are damaged, or not of this run; nothing was changed.
+      InvalidInput: all are damaged, or belong to another run; nothing was changed.
       OSError: a damaged one cannot be renamed.
     """
     found = checkpoint.find(logdir)
@@ -185,7 +187,7 @@ def _read(found: checkpoint.Found, shapes: PyTree) -> PyTree:
 
 
 def _with_capacity(rings: PyTree, capacity: int) -> PyTree:
-    """Shapes `[N, C, ...]` with another C; counters and empty arrays stay as they are."""
+    """Replaces C in shapes `[N, C, ...]`; keeps counters and empty arrays."""
 
     def reshape(x: jax.ShapeDtypeStruct) -> jax.ShapeDtypeStruct:
         if x.ndim < 2 or not x.shape[1]:
@@ -196,7 +198,7 @@ def _with_capacity(rings: PyTree, capacity: int) -> PyTree:
 
 
 def grow(replay: Replay, capacity: int) -> Replay:
-    """The same steps in a larger buffer, the oldest first."""
+    """Moves the steps to a larger buffer, the oldest first."""
     old = replay.trajectory.reward.shape[1]
 
     def pad(x: jax.Array) -> jax.Array:
@@ -212,7 +214,7 @@ def grow(replay: Replay, capacity: int) -> Replay:
 
 
 def grow_images(images: PyTree, replay: Replay, capacity: int) -> PyTree:
-    """The images of `replay` as `grow` moves its steps, in host memory."""
+    """Moves the images of `replay`, in host memory, as `grow` moves its steps."""
 
     def pad(x: np.ndarray) -> np.ndarray:
         if not x.size:
@@ -225,5 +227,5 @@ def grow_images(images: PyTree, replay: Replay, capacity: int) -> PyTree:
 
 
 def _oldest(replay: Replay) -> int:
-    """Where the oldest step lies."""
+    """Index of the oldest step."""
     return (int(replay.head) - int(replay.size)) % replay.trajectory.reward.shape[1]

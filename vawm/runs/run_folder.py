@@ -1,4 +1,4 @@
-"""The folder of one run: who may use it, and what it says it holds."""
+"""The folder of a run: its checks, its lock and its `config.json`."""
 
 from __future__ import annotations
 
@@ -13,35 +13,34 @@ import socket
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from vawm import config as config_lib
-from vawm.config import Config
+from vawm.config import Config, as_dict
 from vawm.errors import InvalidInput
-from vawm.runs.checkpoint import manifest as manifest_lib
+from vawm.runs.checkpoint import manifest
 
 HELD = (errno.EAGAIN, errno.EACCES)
 NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.EINVAL)
-"""What a lock fails with where another has it, and where the file system has none."""
+"""Errors of a lock that another process holds, and of file systems without locks."""
 LOCK, CONFIG, REPLACED = "lock", "config.json", "replaced-"
 
 
 def check_new(logdir: pathlib.Path) -> None:
-    """Refuses a folder that cannot be made, written to, or holds something already.
+    """Refuses a folder that is not writable or not empty; writes nothing.
 
     Raises:
-      InvalidInput: nothing was written.
+      InvalidInput: it is not writable or not empty.
     """
     check_writable(logdir)
     if logdir.is_dir() and any(path.name != LOCK for path in logdir.iterdir()):
         others = "start over with --fresh or choose another --logdir"
-        remedy = f"exists; continue that run with --resume, {others}"
+        remedy = f"already exists; continue that run with --resume, {others}"
         raise InvalidInput("logdir", str(logdir), remedy)
 
 
 def check_writable(folder: pathlib.Path, name: str = "logdir") -> None:
-    """Refuses a path at which no folder can be written; `name` is the option it came from.
+    """Refuses a folder that is not writable; `name` is its command-line option.
 
     Raises:
-      InvalidInput: nothing was written.
+      InvalidInput: it is not writable; nothing was written.
     """
     try:
         nearest = folder.absolute()
@@ -56,31 +55,32 @@ def check_writable(folder: pathlib.Path, name: str = "logdir") -> None:
 
 
 def check_fresh(logdir: pathlib.Path) -> None:
-    """Refuses to start over where no run is, and something else.
+    """Refuses to start over in a folder with other files than those of a run.
 
     Raises:
-      InvalidInput: `put_aside` would move files of which this package knows nothing.
+      InvalidInput: `put_aside` would move files that this package did not write.
     """
     check_writable(logdir)
     names = [path.name for path in logdir.iterdir()] if logdir.is_dir() else []
     ours = rf"{LOCK}|{re.escape(CONFIG)}\.tmp|{REPLACED}\d+"
     others = [name for name in names if not re.fullmatch(ours, name)]
     saved = any(logdir.glob(f"checkpoints/{'[0-9]' * 12}"))
-    begun = [logdir / CONFIG, *logdir.glob(f"{REPLACED}*/{CONFIG}")]  # or put aside in part
+    # In `replaced-*` if an earlier `put_aside` was interrupted.
+    begun = [logdir / CONFIG, *logdir.glob(f"{REPLACED}*/{CONFIG}")]
     if others and not saved and not any(map(_content, begun)):
-        remedy = "holds files, but no run to start over; choose another --logdir"
+        remedy = "contains files, but no run to start over; choose another --logdir"
         raise InvalidInput("logdir", str(logdir), remedy)
 
 
 @contextlib.contextmanager
 def claim(logdir: pathlib.Path, *, say: Callable[[str], None] = print) -> Iterator[None]:
-    """Makes the folder and holds it for this process alone.
+    """Makes the folder and locks it for this process.
 
-    The kernel gives the lock back when a process ends, however it ends. Where the file system
-    has no locks, `say` is told so.
+    The kernel releases the lock when the process ends, in whatever way. `say` prints a
+    warning if the file system has no locks.
 
     Raises:
-      InvalidInput: another process holds it, or the folder cannot be made.
+      InvalidInput: another process holds the lock, or the folder cannot be made.
     """
     try:
         logdir.mkdir(parents=True, exist_ok=True)
@@ -100,8 +100,8 @@ def claim(logdir: pathlib.Path, *, say: Callable[[str], None] = print) -> Iterat
             if error.errno not in NO_LOCKS:
                 raise
             say(
-                f"WARNING: the file system of {logdir} has no locks ({error.strerror}): "
-                "nothing keeps a second run out of this folder"
+                f"WARNING: the file system of {logdir} has no locks ({error.strerror}); do "
+                "not start a second run in this folder"
             )
         file.truncate(0)
         file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
@@ -110,15 +110,15 @@ def claim(logdir: pathlib.Path, *, say: Callable[[str], None] = print) -> Iterat
 
 
 def write_config(logdir: pathlib.Path, config: Config) -> None:
-    """Writes `config.json`: all choices of the run and what wrote them.
+    """Writes `config.json`: all choices of the run and the version that wrote them.
 
     Raises:
-      OSError: it could not be written; the folder is as it was before.
+      OSError: it could not be written; the folder is unchanged.
     """
     content = {
-        "schema": manifest_lib.SCHEMA,
-        "vawm": manifest_lib.version(),
-        "config": config_lib.as_dict(config),
+        "schema": manifest.SCHEMA,
+        "vawm": manifest.version(),
+        "config": as_dict(config),
     }
     scratch = logdir / (CONFIG + ".tmp")
     try:
@@ -130,41 +130,44 @@ def write_config(logdir: pathlib.Path, config: Config) -> None:
 
 
 def read_config(logdir: pathlib.Path) -> Config | None:
-    """What `write_config` wrote into `logdir`; None where no run was started.
+    """Reads what `write_config` wrote to `logdir`; None if no run was started there.
 
     Raises:
-      OtherVersion: it has other choices than this one knows.
+      OtherVersion: it has fields that this version does not know.
     """
     path = logdir / CONFIG
     content = _content(path)
     if content is None:
         return None
     try:
-        return manifest_lib.config_from_dict(content["config"])
+        return manifest.config_from_dict(content["config"])
     except InvalidInput as error:
         written = content["vawm"]
-        raise manifest_lib.OtherVersion("logdir", path, error, written=written) from error
+        raise manifest.OtherVersion("logdir", path, error, written=written) from error
 
 
 def _content(path: pathlib.Path) -> dict[str, Any] | None:
-    """What `write_config` wrote; None where it is something else."""
+    """What `write_config` wrote; None if the file has other content."""
     try:
         content = json.loads(path.read_text())
     except (OSError, ValueError, RecursionError):
         return None
     if not isinstance(content, dict) or not {"schema", "vawm", "config"} <= content.keys():
         return None
-    return None if "format" in content else content  # of an exported policy
+    return None if "format" in content else content  # "format": an exported policy
 
 
 def put_aside(logdir: pathlib.Path) -> pathlib.Path | None:
-    """Moves all that is in the folder into a new `replaced-<number>` in it; None if nothing.
+    """Moves the content of the folder to a new `replaced-<number>` in it.
 
-    What earlier calls have put aside stays where it is. `config.json` and the checkpoints go
-    first: what is left if this is interrupted is no run that would be resumed.
+    Earlier `replaced-<number>` stay in place. `config.json` and the checkpoints are moved
+    first, so that after an interruption the rest cannot be resumed.
+
+    Returns:
+      The new folder, or None if there was nothing to move.
 
     Raises:
-      OSError: something cannot be moved.
+      OSError: a file cannot be moved.
     """
     kept = (LOCK, f"{REPLACED}*")
     found = [p for p in sorted(logdir.iterdir()) if not any(map(p.match, kept))]
@@ -180,7 +183,7 @@ def put_aside(logdir: pathlib.Path) -> pathlib.Path | None:
 
 
 def clear(logdir: pathlib.Path) -> None:
-    """Removes what a run measured that saved nothing; it is about to measure it again."""
+    """Deletes the metrics of a run without a checkpoint, before it starts again."""
     lines = ("metrics.jsonl*", "checkpoints.jsonl*", "videos.jsonl*")
     for pattern in (*lines, "events.out.tfevents.*", "videos/*", "diagnosis.json"):
         for path in logdir.glob(pattern):

@@ -1,8 +1,8 @@
 """The host loop around the jitted step: logging, progress, checkpoints, signals.
 
-Everything a run needs to continue bit for bit is in its checkpoint: the `TrainState`, and
-the host's `Progress`, with the interval since the last line of metrics. A resumed run cuts
-`metrics.jsonl` back to that line and goes on as if nothing had happened.
+A checkpoint has everything that a run needs to continue bit for bit: the `TrainState`, and the
+host's `Progress` with the interval since the last line of metrics. A resumed run cuts
+`metrics.jsonl` back to that line and continues from there.
 """
 
 from __future__ import annotations
@@ -24,13 +24,14 @@ from vawm.envs.protocol import Environment, EnvironmentFailure, HostEnvironment
 from vawm.errors import InvalidInput
 from vawm.process import signals, streams
 from vawm.runs import budget, checkpoint, diagnosis, run_folder, suites, validate
-from vawm.runs import resume as resume_lib
-from vawm.runs import trainer as program_lib
-from vawm.runs.checkpoint import manifest as manifest_lib
+from vawm.runs.checkpoint import manifest
 from vawm.runs.reports import backends, tracking, video
 from vawm.runs.reports.display import Display
 from vawm.runs.reports.tracking import Interval, Line
-from vawm.runs.trainer import Program
+from vawm.runs.resume import check as check_resume
+from vawm.runs.resume import cut_back, restore
+from vawm.runs.trainer import Kept, Trainer, everything
+from vawm.runs.trainer import make as make_trainer
 from vawm.types import PyTree
 
 
@@ -39,12 +40,12 @@ class RunError(RuntimeError):
 
 
 class Progress(NamedTuple):
-    """What the host knows of a run, in plain numbers.
+    """The counters of the host loop, as plain numbers.
 
     Attributes:
       env_steps: control steps so far.
       updates: updates so far.
-      seconds: of all steps so far; what lines, videos and checkpoints took is not in it.
+      seconds: of all steps so far, without the time for lines, videos and checkpoints.
       logged: env steps at the last line of metrics.
       interval: measured since that line.
     """
@@ -60,9 +61,9 @@ class Result(NamedTuple):
     """How a run ended.
 
     Attributes:
-      logdir: where everything is.
+      logdir: the folder of the run.
       env_steps: control steps done.
-      exit_code: 0, or what a shell expects after the signal that stopped it.
+      exit_code: 0, or the shell's exit code for the signal that stopped the run.
     """
 
     logdir: pathlib.Path
@@ -82,19 +83,19 @@ def run(
     banner: str = "",
     command: str = "the same command",
 ) -> Result:
-    """Trains until `config.env_steps`, or until a signal asks for the end.
+    """Trains until `config.env_steps`, or until a signal asks to stop.
 
     Args:
       config: all choices of the run.
-      logdir: a folder that is empty or not there yet; of the run to resume otherwise.
-      resume: continue from the newest whole checkpoint in `logdir`, or from the start where
-        a run was stopped before its first. Newer ones that are damaged are renamed.
-      fresh: start over in `logdir`; what is there goes into a folder `replaced-<number>`.
-      env: an environment in place of the one that `config.task` names; one on the host is
-        closed at the end.
-      console: where progress goes; standard output by default.
-      banner: printed once the run is known to start.
-      command: how the caller was started, for the advice at the end.
+      logdir: a new or empty folder; with `resume`, the folder of the run.
+      resume: continue from the newest undamaged checkpoint in `logdir`, or from the start if
+        the run stopped before its first one. Renames newer checkpoints, which are damaged.
+      fresh: start over in `logdir`; moves its content to a folder `replaced-<number>`.
+      env: replaces the environment that `config.task` names; a host environment is closed
+        at the end.
+      console: prints progress; standard output by default.
+      banner: printed when the run starts, after all checks.
+      command: the caller's command line, for the advice at the end.
 
     Raises:
       InvalidInput: before anything is compiled, allocated or written.
@@ -110,31 +111,31 @@ def run(
         if not isinstance(env, Environment | None):
             stack.enter_context(contextlib.closing(env))
         check(config, logdir, resume=resume, fresh=fresh, known_task=env is None)
-        program = stack.enter_context(contextlib.closing(prepare(config, env)))
+        trainer = stack.enter_context(contextlib.closing(prepare(config, env)))
         stack.enter_context(run_folder.claim(logdir, say=say))
         if banner:
             say(banner)
         if resume and checkpoint.latest(logdir):
-            state, progress = _continue(logdir, program, say)
+            state, progress = _continue(logdir, trainer, say)
             run_folder.write_config(logdir, config)
         else:
             if fresh and (aside := run_folder.put_aside(logdir)):
-                say(f"what was in {logdir} is in {aside} now: this run starts over")
+                say(f"starting over; moved the old content of {logdir} to {aside}")
             if resume:
                 run_folder.clear(logdir)
-                say(f"no checkpoint in {logdir} yet: this run starts from the beginning")
+                say(f"no checkpoint in {logdir} yet; starting from the beginning")
             run_folder.write_config(logdir, config)
-            state, progress = program.init(config.seed), Progress()
+            state, progress = trainer.init(config.seed), Progress()
             _refuse_nonfinite(state)
-        result = _loop(config, logdir, program, state, progress, console)
+        result = _loop(config, logdir, trainer, state, progress, console)
     _summarise(config, result, say, command, known_task=env is None)
     return result
 
 
 def _refuse_nonfinite(state: PyTree) -> None:
-    """Refuses first observations that are not finite, which no chunk has counted."""
+    """Refuses first observations that are not finite: no chunk counts them."""
     if found := diagnosis.nonfinite_steps(state):
-        raise RunError(f"{diagnosis.where(found[0])} where the run begins: mend that")
+        raise RunError(f"{diagnosis.where(found[0])} at the first reset; fix the environment")
 
 
 def check(
@@ -145,7 +146,7 @@ def check(
     fresh: bool = False,
     known_task: bool = True,
 ) -> None:
-    """Refuses what cannot work; takes milliseconds and writes nothing.
+    """Refuses a run that cannot work; takes milliseconds and writes nothing.
 
     Raises:
       InvalidInput: names field, value and remedy.
@@ -153,12 +154,14 @@ def check(
     validate.check(config)
     if known_task:
         suites.check_task(config)
-    if not resume:  # a run that was begun goes on without its tracker
+    if not resume:  # a resumed run continues even without its tracker
         backends.check(config)
     if resume and fresh:
-        raise InvalidInput("fresh", True, "starts over, and --resume goes on; leave one out")
+        raise InvalidInput(
+            "fresh", True, "cannot be combined with --resume; remove one of them"
+        )
     if resume:
-        resume_lib.check(logdir, config)
+        check_resume(logdir, config)
         for folder in (logdir, checkpoint.root(logdir)):
             run_folder.check_writable(folder)
     elif fresh:
@@ -171,57 +174,58 @@ def prepare(
     config: Config,
     env: Environment | HostEnvironment | None = None,
     *,
-    kept: program_lib.Kept = program_lib.everything,
-) -> Program:
-    """Builds the run's functions and refuses one that does not fit into memory.
+    kept: Kept = everything,
+) -> Trainer:
+    """Builds the trainer of a run; refuses a run that does not fit into memory.
 
-    Metrics that are not `kept` are not computed either.
+    Metrics that are not `kept` are not computed.
 
     Raises:
-      InvalidInput: with the numbers, and the largest replay that would fit.
+      InvalidInput: too little memory; names the numbers and the largest replay that fits.
     """
-    program = program_lib.make(config, env, kept=kept)
+    trainer = make_trainer(config, env, kept=kept)
     try:
         budget.check(
-            budget.estimate(program.shapes, program.spec, config),
+            budget.estimate(trainer.shapes, trainer.spec, config),
             budget.available(),
             config,
             smallest=validate.smallest_replay(config),
         )
     except BaseException:
-        program.close()
+        trainer.close()
         raise
-    return program
+    return trainer
 
 
 def _continue(
-    logdir: pathlib.Path, program: Program, say: Callable[[str], None]
+    logdir: pathlib.Path, trainer: Trainer, say: Callable[[str], None]
 ) -> tuple[PyTree, Progress]:
-    restored = resume_lib.restore(logdir, program.shapes)
+    restored = restore(logdir, trainer.shapes)
     if restored.warning:
         say(f"WARNING: {restored.warning}")
-    then, now = restored.manifest.computed, manifest_lib.computed()
+    then, now = restored.manifest.computed, manifest.computed()
     if then != now:
-        say(f"WARNING: begun with {then}, goes on with {now}: not bit for bit one piece")
-    state, lost = program.resume(restored.state, restored.episodes)
+        text = f"started with {then}, resuming with {now}: results may not be bit-identical"
+        say(f"WARNING: {text}")
+    state, lost = trainer.resume(restored.state, restored.episodes)
     if lost:
         say(
-            f"warning: {lost} of {program.spec.num_envs} environments did not do the same "
-            "again when their episodes were played once more; they begin new ones"
+            f"warning: the episodes of {lost} of {trainer.spec.num_envs} environments could "
+            "not be replayed exactly; starting new episodes"
         )
     progress = _progress(restored.manifest.progress)
-    missing = resume_lib.cut_back(logdir, env_steps=progress.env_steps, logged=progress.logged)
+    missing = cut_back(logdir, env_steps=progress.env_steps, logged=progress.logged)
     if missing:
         say(f"WARNING: {missing}")
-    say(f"going on at {progress.env_steps} env steps")
+    say(f"resuming at {progress.env_steps} env steps")
     return state, progress
 
 
 def _progress(saved: dict[str, Any]) -> Progress:
-    """What `Saver` was given.
+    """The `Progress` that was saved in a checkpoint.
 
     Raises:
-      InvalidInput: it was written with other counters.
+      InvalidInput: it has other counters, because another version wrote it.
     """
     try:
         progress = Progress(**saved | {"interval": Interval(**saved["interval"])})
@@ -231,21 +235,21 @@ def _progress(saved: dict[str, Any]) -> Progress:
                     raise TypeError(f"{name} is {value!r:.40}")
         return progress
     except (TypeError, KeyError) as error:
-        remedy = f"does not have the counters of a run ({error}); it is of another version"
+        remedy = f"has wrong counters ({error}); resume with the version that wrote it"
         raise InvalidInput("checkpoint", "progress", remedy) from error
 
 
 def _loop(
     config: Config,
     logdir: pathlib.Path,
-    program: Program,
+    trainer: Trainer,
     state: PyTree,
     progress: Progress,
     console: rich.console.Console,
 ) -> Result:
-    """Chunk after chunk; the only place where the device and the host meet."""
+    """Runs chunk after chunk; the only place where the host waits for the device."""
     display = Display(console, start=progress.env_steps, total=config.env_steps)
-    film = video.make(program, config)
+    film = video.make(trainer, config)
     log_save = functools.partial(_append, logdir / tracking.SAVE_LINES)
     last_saved = progress.env_steps
     resumed = bool(progress.env_steps)
@@ -267,15 +271,15 @@ def _loop(
         checkpoint.Saver(
             logdir,
             config,
-            program.spec,
+            trainer.spec,
             before=logdir / tracking.METRICS,
             log=log_save,
             say=display.note,
         ) as saver,
     ):
         tracker.show_videos(after=progress.logged)
-        display.note("compiling (a minute for new settings, seconds for those of before) ...")
-        step = program.compile(state).run
+        display.note("compiling (about a minute, seconds if cached) ...")
+        step = trainer.compile(state).run
         last = progress.env_steps >= config.env_steps or stop.signal is not None
         while not last:
             before, began = progress.env_steps, time.perf_counter()
@@ -283,16 +287,16 @@ def _loop(
             metrics = jax.device_get(metrics)
             progress = advance(progress, metrics, began=began)
             done = progress.env_steps >= config.env_steps
-            last = done or stop.signal is not None  # read once: what ends a run is saved
+            last = done or stop.signal is not None  # read once, so that the last step is saved
             if reason := diagnosis.reason(state, metrics, last=last):
                 _stop(reason, config, logdir, state, metrics, progress, tracker, saver)
-            saver.check()  # after that, which says more than a save that fails for it
+            saver.check()  # after `_stop`: its error says more than a failed save
             if _crossed(before, progress.env_steps, config.log_every):
                 line = _line(progress)
                 tracker.write(line)
                 display.log(line)
                 progress = progress._replace(logged=progress.env_steps, interval=Interval())
-            elif done:  # an incomplete interval, dropped again if the run is extended
+            elif done:  # an incomplete interval; its line is dropped if the run is extended
                 tracker.write(_line(progress))
             if film and _crossed(before, progress.env_steps, config.video.every):
                 tracker.write_videos(film(state), env_steps=progress.env_steps)
@@ -303,7 +307,7 @@ def _loop(
                     state,
                     env_steps=progress.env_steps,
                     progress=progress._asdict() | {"interval": progress.interval._asdict()},
-                    episodes=program.episodes(),
+                    episodes=trainer.episodes(),
                 )
                 last_saved = progress.env_steps
             display.advance(progress.env_steps, progress.interval)
@@ -314,12 +318,12 @@ def advance(progress: Progress, metrics: Mapping[str, Any], *, began: float) -> 
     """`progress` after one more chunk, which started at `began`.
 
     Raises:
-      RunError: the chunk was a step backwards.
+      RunError: `env_steps` decreased.
     """
     seconds = time.perf_counter() - began
     env_steps = int(metrics["env_steps"])
-    if env_steps < progress.env_steps:  # as many where all environments were reset
-        raise RunError(f"env_steps went from {progress.env_steps} back to {env_steps}")
+    if env_steps < progress.env_steps:  # equal if the chunk reset all environments
+        raise RunError(f"env_steps decreased from {progress.env_steps} to {env_steps}")
     return Progress(
         env_steps=env_steps,
         updates=int(metrics["updates"]),
@@ -362,23 +366,23 @@ def _stop(
     tracker: tracking.Tracker,
     saver: checkpoint.Saver,
 ) -> NoReturn:
-    """What is not finite never comes back: better no run than a wrong one."""
+    """Stops the run with a diagnosis: NaN and infinity do not recover."""
     tracker.write(_line(progress))
     written = diagnosis.write(logdir, config, state, metrics)
-    with contextlib.suppress(checkpoint.SaveError, OSError):  # not the reason
+    with contextlib.suppress(checkpoint.SaveError, OSError):  # report `reason` instead
         saver.wait()
     raise RunError(
         f"{reason} at env_steps={progress.env_steps}; "
-        f"kept: {checkpoint.kept(logdir)}; more in {written}. "
+        f"kept: {checkpoint.kept(logdir)}; details in {written}. "
         f"{diagnosis.advice(state)}"
     )
 
 
 @contextlib.contextmanager
 def _explained(logdir: pathlib.Path):
-    """One line for what ends a run from outside: memory, an environment, the disk.
+    """Turns errors of memory, environments and the disk into a `RunError` with one line.
 
-    Checkpoints have a `SaveError` of their own.
+    A checkpoint that cannot be written raises `SaveError`.
     """
     try:
         yield
@@ -392,14 +396,14 @@ def _explained(logdir: pathlib.Path):
         remedy = "use a smaller replay.capacity or batch, or a machine with more memory"
         raise RunError(f"out of memory on the host: {remedy} ({error})") from error
     except EnvironmentFailure as error:
-        remedy = "to begin a new episode instead, start with --env.on-failure restart"
+        remedy = "to start a new episode instead, use --env.on-failure restart"
         raise RunError(f"{error}; kept: {checkpoint.kept(logdir)}; {remedy}") from error
     except OSError as error:
         full = error.errno == errno.ENOSPC
         free = f" ({checkpoint.free_space(logdir)} free)" if full else ""
         raise RunError(
             f"{error.filename or logdir}: {error.strerror or error}{free}; "
-            "put that right, then go on with --resume or start again"
+            "fix the cause, then continue with --resume or start again"
         ) from error
 
 
@@ -424,13 +428,13 @@ def _summarise(
     evaluation = f"python -m vawm.evaluate --logdir {shlex.quote(str(result.logdir))}"
     resumption = f"{command} --resume --logdir {shlex.quote(str(result.logdir))}"
     longer = f" --env-steps {2 * config.env_steps}"
-    if not known_task:  # no command line makes its environment
+    if not known_task:  # there is no command line for the user's environment
         folder = repr(str(result.logdir))
         evaluation = f"vawm.evaluate.evaluate(vawm.load({folder}), episodes=..., env=...)"
         resumption = f"vawm.runs.runner.run(config, {folder}, env=..., resume=True)"
-        longer = ", its env_steps larger"
+        longer = ", with larger config.env_steps"
     if finished:
-        text += [f"evaluate with: {evaluation}", f"go on with: {resumption}{longer}"]
+        text += [f"evaluate with: {evaluation}", f"train longer with: {resumption}{longer}"]
     else:
         text.append(f"resume with: {resumption}")
     say("\n".join(text))

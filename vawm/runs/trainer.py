@@ -1,4 +1,4 @@
-"""What the host loop runs: the functions of one run, on the device alone or with a host."""
+"""The compiled functions of a run, with environments on the device or on the host."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from vawm.types import EnvSpec, PyTree
 
 Arrays = dict[str, np.ndarray]
 Kept = Callable[[str], bool]
-"""Whether a metric, by its name, is to be measured."""
+"""Whether to compute the metric with this name."""
 
 
 def everything(name: str) -> bool:
@@ -30,31 +30,31 @@ def everything(name: str) -> bool:
 
 
 class CompiledStep(NamedTuple):
-    """A training step, ready to run.
+    """A compiled training step.
 
     Attributes:
-      run: `(state) -> (state, metrics)`; uses its state up.
-      executables: what it runs on the device, one after the other.
+      run: `(state) -> (state, metrics)`; donates its state.
+      executables: the compiled functions that it runs on the device, in order.
     """
 
     run: Callable[[TrainState], tuple[TrainState, Mapping[str, Any]]]
     executables: tuple[jax.stages.Compiled, ...]
 
 
-class Program(NamedTuple):
-    """The functions of a run; nothing is allocated before `init`.
+class Trainer(NamedTuple):
+    """The compiled functions of a run; nothing is allocated before `init`.
 
     Attributes:
       spec: of the environments.
-      agent: what learns.
+      agent: the agent that learns.
       shapes: of the `TrainState`.
       init: `(seed) -> state`.
-      compile: `(state) -> step` for states like this one.
-      episodes: `() -> arrays` with which the running episodes can be played again; None
-        where the state holds the environments itself.
-      resume: `(state, episodes) -> (state, count)`: the environments as they were, of which
-        `count` could not be played again and begin new episodes.
-      close: stops what runs outside of the device.
+      compile: `(state) -> step` for states with these shapes.
+      episodes: `() -> arrays` from which the running episodes can be replayed; None if the
+        state contains the environments.
+      resume: `(state, episodes) -> (state, count)`, restores the environments; `count`
+        episodes could not be replayed and start again.
+      close: stops the environments on the host.
     """
 
     spec: EnvSpec
@@ -72,13 +72,13 @@ def make(
     env: Environment | HostEnvironment | None = None,
     *,
     kept: Kept = everything,
-) -> Program:
-    """The functions that train `config`, in `env` or the environments that it names.
+) -> Trainer:
+    """Builds the trainer of `config`, for `env` or the environments that it names.
 
-    Metrics that are not `kept` are not computed either, but for what updates need anyway.
+    Metrics that are not `kept` are not computed, unless updates need them.
 
     Raises:
-      InvalidInput: environments that cannot be made, or choices that they do not allow.
+      InvalidInput: the environments cannot be made, or do not fit the config.
     """
     env = env or suites.make(config)
     try:
@@ -95,7 +95,7 @@ def make(
 
 def on_device(
     env: Environment, agent: Agent, config: Config, kept: Kept = everything
-) -> Program:
+) -> Trainer:
     """Simulation, replay and learning in one jitted step."""
     train_step = train.make_train_step(env, agent, config)
 
@@ -110,7 +110,7 @@ def on_device(
         compiled = step.lower(state).compile()
         return CompiledStep(compiled, (compiled,))
 
-    return Program(
+    return Trainer(
         spec=env.spec,
         agent=agent,
         shapes=init.eval_shape(jax.random.key(0)),
@@ -124,8 +124,8 @@ def on_device(
 
 def on_host(
     env: HostEnvironment, agent: Agent, config: Config, kept: Kept = everything
-) -> Program:
-    """The same update around environments on the host."""
+) -> Trainer:
+    """The same update, with environments on the host."""
     spec, seed = env.spec, config.seed
     begin = jax.jit(functools.partial(host_train.init, agent, config))
     shapes = begin.eval_shape(jax.random.key(0), host_train.first_timestep(spec))
@@ -147,7 +147,7 @@ def on_host(
 
     def resume(state: TrainState, episodes: Arrays | None) -> tuple[TrainState, int]:
         if episodes is None:
-            remedy = "was not written with environments on the host; resume it with its own"
+            remedy = "has no environments on the host; resume with the original environments"
             raise InvalidInput("checkpoint", "without episodes", remedy)
         collector = state.collector
         expected = jax.device_get(collector.timestep)
@@ -160,7 +160,7 @@ def on_host(
         )
         return state._replace(collector=collector), int((~same).sum())
 
-    return Program(
+    return Trainer(
         spec=spec,
         agent=agent,
         shapes=shapes,

@@ -29,8 +29,8 @@ from vawm.cli import command_line
 from vawm.config import Config
 from vawm.process import huge_pages
 from vawm.runs import runner, suites, validate
-from vawm.runs import trainer as program_lib
 from vawm.runs.runner import RunError
+from vawm.runs.trainer import Kept, everything
 
 WARM_UP = 2
 """Samples that are not counted."""
@@ -129,10 +129,10 @@ def main(suite: str, flags: Sequence[str], asked: IO[str], answers: IO[str]) -> 
     config = command_line.parse(flags, suite=suite, description="").config
     validate.check(config)
     suites.check_task(config)
-    with contextlib.closing(runner.prepare(config, kept=_kept(config))) as program:
-        state = program.init(config.seed)
+    with contextlib.closing(runner.prepare(config, kept=_kept(config))) as trainer:
+        state = trainer.init(config.seed)
         begin = time.perf_counter()
-        step, executables = program.compile(state)
+        step, executables = trainer.compile(state)
         compile_s = time.perf_counter() - begin
         updates = 0
         while not updates:  # until replay can fill a batch
@@ -166,11 +166,11 @@ def steps_of_a_sample(config: Config) -> int:
     return config.replay.batch_steps // math.gcd(config.replay.batch_steps, earned)
 
 
-def _kept(config: Config) -> program_lib.Kept:
+def _kept(config: Config) -> Kept:
     """Without value alignment its metrics are not computed either."""
     if config.value_alignment.weight == "off":
         return lambda name: "alignment" not in name
-    return program_lib.everything
+    return everything
 
 
 def peak_bytes(executables: Sequence[jax.stages.Compiled]) -> int:

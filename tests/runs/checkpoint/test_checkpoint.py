@@ -1,4 +1,4 @@
-"""Checkpoints: bit for bit, all or nothing, never a silent difference."""
+"""Checkpoints: restored bit for bit, complete or absent, never silently different."""
 
 import contextlib
 import errno
@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 import tiny
 import toy
+from refusals import refused
 from runs import files_of, save_toy
 
-from vawm import config as config_lib
-from vawm.errors import InvalidInput
+from vawm.config import as_dict
 from vawm.runs import checkpoint
 from vawm.runs.checkpoint import manifest
 
@@ -30,7 +30,7 @@ def save(logdir, state, env_steps=8, **changes):
     return save_toy(logdir, state, env_steps, **{"progress": PROGRESS} | changes)
 
 
-def test_everything_comes_back_bit_for_bit(tmp_path):
+def test_everything_is_restored_bit_for_bit(tmp_path):
     state = toy.state()
     save(tmp_path, state)
     restored, saved = checkpoint.restore(tmp_path, jax.eval_shape(lambda: state))
@@ -63,7 +63,7 @@ EPISODES = {
 }
 
 
-def test_images_and_episodes_of_the_host_come_back_as_numpy(tmp_path):
+def test_images_and_episodes_of_the_host_are_restored_as_numpy(tmp_path):
     state = with_images()
     save(tmp_path, state, episodes=EPISODES)
     restored, _ = checkpoint.restore(tmp_path, state)
@@ -85,19 +85,19 @@ def test_a_state_without_environments_on_the_host_has_no_episodes(tmp_path):
 
 
 @pytest.mark.parametrize("item", ["images", "episodes"])
-def test_damage_to_what_the_host_keeps_is_noticed(tmp_path, item):
+def test_damage_to_arrays_of_the_host_is_noticed(tmp_path, item):
     state = with_images()
     path = save(tmp_path, state, episodes=EPISODES)
     largest = max(files_of(path / item), key=lambda file: file.stat().st_size)
     data = bytearray(largest.read_bytes())
     data[len(data) // 2] ^= 1
     largest.write_bytes(bytes(data))
-    with pytest.raises(InvalidInput, match="does not match its checksum"):
+    with refused("checkpoint", str(largest), naming="checksum"):
         checkpoint.restore(tmp_path, state), checkpoint.restore_episodes(tmp_path)
 
 
 def with_model_state():
-    """A state whose world model carries something from update to update."""
+    """A state with a world model that has a `model_state`."""
     state = toy.state()
     mean = jnp.array([0.25, -3.0])
     statistics = {"encoder": {"mean": mean, "var": mean**2}, "decoder": {"vector": ()}}
@@ -105,7 +105,7 @@ def with_model_state():
 
 
 @pytest.mark.parametrize("make", [toy.state, with_model_state])
-def test_what_acting_needs_is_read_without_the_rest(tmp_path, make):
+def test_what_is_needed_to_act_is_read_without_the_rest(tmp_path, make):
     state = make()
     learner = state.learner
     path = save(tmp_path, state)
@@ -117,7 +117,7 @@ def test_what_acting_needs_is_read_without_the_rest(tmp_path, make):
     assert saved.config == tiny.CONFIG
 
 
-def test_what_a_world_model_carries_comes_back_bit_for_bit(tmp_path):
+def test_the_model_state_is_restored_bit_for_bit(tmp_path):
     state = with_model_state()
     path = save(tmp_path, state)
     restored, saved = checkpoint.restore(tmp_path, jax.eval_shape(lambda: state))
@@ -126,45 +126,49 @@ def test_what_a_world_model_carries_comes_back_bit_for_bit(tmp_path):
     assert not [name for name in saved.leaves["state"] if "model_state" in name]
     largest = max(files_of(path / "model_state"), key=lambda file: file.stat().st_size)
     largest.unlink()
-    with pytest.raises(InvalidInput, match="damaged"):
+    with refused("checkpoint", str(largest)):
         checkpoint.restore_agent(tmp_path, state.learner.params, state.learner.model_state)
 
 
 @pytest.mark.parametrize("make", [toy.state, with_model_state])
-def test_other_things_that_a_world_model_carries_are_named(tmp_path, make):
+def test_another_model_state_is_refused_by_name(tmp_path, make):
     save(tmp_path, make())
     learner = with_model_state().learner
     wanted = {"encoder": {"mean": jnp.zeros(3), "var": jnp.zeros(2)}}
-    with pytest.raises(
-        InvalidInput, match=r"\['encoder'\]\['mean'\] is .*expected float32\[3\]"
-    ):
+    with refused("checkpoint", naming=["['encoder']['mean']", "float32[3]"]):
         checkpoint.restore_agent(tmp_path, learner.params, wanted)
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("change", "named"),
     [
-        (lambda s: s._replace(env_steps=jnp.zeros(2, jnp.int32)), r"\.env_steps is int32\[\]"),
-        (lambda s: s._replace(env_steps=jnp.zeros(())), r"expected float32\[\]"),
-        (lambda s: s._replace(key=jnp.zeros((2, 2), jnp.uint32)), r"\.key is key<fry>\[2\]"),
-        (lambda s: s._replace(replay={"more": s.env_steps, **s.replay}), "is missing"),
-        (lambda s: s._replace(replay={}), "expected nothing; .* and 1 more leaves"),
+        (
+            lambda s: s._replace(env_steps=jnp.zeros(2, jnp.int32)),
+            [".env_steps is int32[]", "int32[2]"],
+        ),
+        (lambda s: s._replace(env_steps=jnp.zeros(())), [".env_steps is int32[]", "float32[]"]),
+        (lambda s: s._replace(key=jnp.zeros((2, 2), jnp.uint32)), [".key is key<fry>[2]"]),
+        (
+            lambda s: s._replace(replay={"more": s.env_steps, **s.replay}),
+            ["['more'] is missing"],
+        ),
+        (lambda s: s._replace(replay={}), ["expected nothing", "1 more"]),
     ],
 )
-def test_a_leaf_that_differs_is_named(tmp_path, change, message):
+def test_a_leaf_that_differs_is_named(tmp_path, change, named):
     save(tmp_path, toy.state())
-    with pytest.raises(InvalidInput, match=message):
+    with refused("checkpoint", naming=named):
         checkpoint.restore(tmp_path, change(toy.state()))
 
 
 def test_another_width_is_refused_with_both_shapes(tmp_path):
     save(tmp_path, toy.state(width=3))
-    with pytest.raises(InvalidInput, match=r"float32\[2,3\], expected float32\[2,4\]"):
+    with refused("checkpoint", naming=["float32[2,3]", "float32[2,4]"]):
         checkpoint.restore(tmp_path, toy.state(width=4))
 
 
 @pytest.mark.parametrize("keep", [1, 2])
-def test_as_many_as_asked_for_are_kept_the_newest_ones(tmp_path, keep):
+def test_the_newest_checkpoints_are_kept_as_many_as_configured(tmp_path, keep):
     for env_steps in (8, 16, 120):
         save(
             tmp_path,
@@ -178,7 +182,7 @@ def test_as_many_as_asked_for_are_kept_the_newest_ones(tmp_path, keep):
     toy.assert_equal(restored, toy.state(120))
 
 
-def test_an_unfinished_checkpoint_is_ignored_and_swept_away(tmp_path):
+def test_an_incomplete_checkpoint_is_ignored_and_deleted(tmp_path):
     first = save(tmp_path, toy.state())
     shutil.copytree(first, first.with_name(checkpoint.SCRATCH + "000000000016"))
     assert checkpoint.latest(tmp_path) == first
@@ -193,14 +197,11 @@ def test_a_full_disk_leaves_the_previous_checkpoint_alone(tmp_path, monkeypatch)
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(manifest, "write", full)
-    with pytest.raises(
-        checkpoint.SaveError, match=r"needed, .* free\): .*No space left"
-    ) as error:
+    with pytest.raises(checkpoint.SaveError, match="No space left") as error:
         save(tmp_path, toy.state(1), 16)
-    assert re.search(r"\(up to \d+ B needed, [\d.]+ [KMG]iB free\)", str(error.value))
-    assert str(error.value).endswith(
-        "kept: the checkpoint at 8; put that right, then go on with --resume"
-    )
+    assert re.search(r"\d+ B needed, [\d.]+ [KMG]iB free", str(error.value))
+    assert "checkpoint at 8" in str(error.value)
+    assert "--resume" in str(error.value)
     monkeypatch.undo()
     assert list(checkpoint.root(tmp_path).iterdir()) == [first]
     toy.assert_equal(checkpoint.restore(tmp_path, toy.state())[0], toy.state())
@@ -210,12 +211,12 @@ def test_a_full_disk_leaves_the_previous_checkpoint_alone(tmp_path, monkeypatch)
     ("nbytes", "text"),
     [(0, "0 B"), (337, "337 B"), (1024, "1.0 KiB"), (1_600_000, "1.5 MiB"), (2**35, "32 GiB")],
 )
-def test_bytes_are_told_in_a_unit_that_suits_them(nbytes, text):
+def test_bytes_are_shown_in_a_suitable_unit(nbytes, text):
     assert checkpoint.writing.amount(nbytes) == text
 
 
 class Stray:
-    """Raises where nobody can hear it, as TensorStore's callbacks do."""
+    """Raises an unraisable exception, as TensorStore's callbacks do."""
 
     def __init__(self, text):
         self._text = text
@@ -225,9 +226,7 @@ class Stray:
 
 
 @pytest.mark.parametrize("error", [None, OSError("full")])
-def test_after_an_error_what_a_closed_loop_is_told_stays_unheard_and_nothing_else(
-    monkeypatch, error
-):
+def test_after_an_error_only_the_traces_of_closed_loops_are_suppressed(monkeypatch, error):
     heard = []
     monkeypatch.setattr(sys, "unraisablehook", lambda stray: heard.append(str(stray.exc_value)))
     with contextlib.suppress(OSError), checkpoint.arrays.quiet():
@@ -239,19 +238,17 @@ def test_after_an_error_what_a_closed_loop_is_told_stays_unheard_and_nothing_els
     assert heard == ([] if error else ["Event loop is closed"]) + ["something else"]
 
 
-# TensorStore may still want to tell the loop that Orbax has closed, once pytest listens again.
+# TensorStore may still report to the loop that Orbax has closed, once pytest listens again.
 @pytest.mark.filterwarnings("ignore:.*:pytest.PytestUnraisableExceptionWarning")
-def test_what_cannot_be_written_is_one_error_and_no_pages_of_traces(tmp_path, caplog):
-    """Files may not grow beyond what all but one array need, as Orbax's threads find out."""
+def test_a_failed_write_is_one_error_without_traces(tmp_path, caplog):
+    """The limit on the size of files fails the write of one array, in Orbax's threads."""
     save_toy(tmp_path, toy.state(8), 8)
     noise = jnp.asarray(np.random.default_rng(0).normal(size=100_000), jnp.float32)
     large = toy.state(16)._replace(replay=noise)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
     try:
-        with pytest.raises(
-            checkpoint.SaveError, match=r"iB free\): .* File too large; kept: "
-        ) as error:
+        with pytest.raises(checkpoint.SaveError, match="File too large") as error:
             save_toy(tmp_path, large, 16)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
@@ -267,31 +264,31 @@ def test_what_cannot_be_written_is_one_error_and_no_pages_of_traces(tmp_path, ca
 def test_parameters_that_are_not_finite_are_not_saved(tmp_path):
     state = toy.state()
     params = state.learner.params._replace(actor={"bias": jnp.array([jnp.nan])})
-    with pytest.raises(checkpoint.SaveError, match=r"\.actor\['bias'\] is not finite"):
+    with pytest.raises(checkpoint.SaveError, match=r"\.actor\['bias'\]"):
         save(tmp_path, state._replace(learner=state.learner._replace(params=params)))
     statistics = {"mean": jnp.array([jnp.inf])}
-    with pytest.raises(checkpoint.SaveError, match=r"\['mean'\] is not finite"):
+    with pytest.raises(checkpoint.SaveError, match=r"\['mean'\]"):
         save(tmp_path, state._replace(learner=state.learner._replace(model_state=statistics)))
     assert checkpoint.latest(tmp_path) is None
 
 
-def test_no_checkpoint_is_said(tmp_path):
-    with pytest.raises(InvalidInput, match="holds no checkpoint"):
+def test_a_folder_without_a_checkpoint_is_refused(tmp_path):
+    with refused("logdir", str(tmp_path)):
         checkpoint.restore(tmp_path, toy.state())
 
 
 def test_a_config_survives_json():
-    content = config_lib.as_dict(tiny.CONFIG)
+    content = as_dict(tiny.CONFIG)
     assert manifest.config_from_dict(content) == tiny.CONFIG
-    with pytest.raises(InvalidInput, match=r"Config\.colour=.*not known"):
+    with refused("Config.colour", 1):
         manifest.config_from_dict(content | {"colour": 1})
 
 
 @pytest.mark.parametrize("env_steps", [8, 16])
-def test_a_run_does_not_go_backwards(tmp_path, env_steps):
+def test_a_checkpoint_older_than_the_newest_is_refused(tmp_path, env_steps):
     newest = save(tmp_path, toy.state(), 16)
     before = files_of(tmp_path)
-    with pytest.raises(checkpoint.SaveError, match="the newest one is at 16 env steps"):
+    with pytest.raises(checkpoint.SaveError, match="16 env steps"):
         save(tmp_path, toy.state(1), env_steps)
     assert files_of(tmp_path) == before
     assert checkpoint.latest(tmp_path) == newest

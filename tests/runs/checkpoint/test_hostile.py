@@ -1,10 +1,11 @@
-"""Checkpoints made to do harm: refused in one line, with no code run and nothing allocated."""
+"""Malicious checkpoints: refused in one line, with no code run and nothing allocated."""
 
 import contextlib
 import hashlib
 import json
 import pathlib
 import pickle
+import re
 import shutil
 
 import numpy as np
@@ -33,7 +34,7 @@ def path(saved, tmp_path):
 
 
 def sign(path, text):
-    """Writes a manifest as one who knows how it is checked."""
+    """Writes a manifest with a matching checksum."""
     (path / manifest.NAME).write_bytes(text)
     (path / manifest.DIGEST).write_text(hashlib.sha256(text).hexdigest() + "\n")
 
@@ -50,7 +51,7 @@ def rename(content, name):
 
 
 def refused(path, match):
-    """That everything that reads the only checkpoint refuses it in one line."""
+    """Checks that all functions that read the only checkpoint refuse it in one line."""
     logdir, learner = path.parents[1], STATE.learner
     for read in (
         lambda: checkpoint.restore(logdir, STATE),
@@ -67,56 +68,54 @@ def refused(path, match):
 )
 def test_a_file_elsewhere_is_refused(path, name):
     rewrite(path, lambda content: rename(content, name))
-    refused(path, "is outside of the checkpoint|belongs to no item")
+    refused(path, f"manifest.*file {re.escape(repr(name))}")
 
 
 @pytest.mark.parametrize("what", ["folder", "file"])
-def test_a_link_is_refused_though_what_it_leads_to_is_right(path, tmp_path, what):
+def test_a_link_to_the_right_file_is_refused(path, tmp_path, what):
     original = path / "params" if what == "folder" else files_of(path / "params")[0]
     moved = original.rename(tmp_path / "elsewhere")
     original.symlink_to(moved)
-    refused(path, "is a symbolic link")
+    refused(path, f"{original.name}': .*link")
 
 
 @pytest.mark.parametrize("name", [manifest.NAME, manifest.DIGEST])
-def test_a_link_in_the_place_of_the_manifest_is_refused(path, tmp_path, name):
+def test_a_link_to_a_manifest_is_refused(path, tmp_path, name):
     (path / name).symlink_to((path / name).rename(tmp_path / "elsewhere"))
-    refused(path, "is not a file")
+    refused(path, f"{name}': ")
 
 
-def test_more_bytes_than_the_leaves_can_need_are_refused_before_they_are_read(
-    path, monkeypatch
-):
+def test_files_too_large_for_their_leaves_are_refused_before_they_are_read(path, monkeypatch):
     def enlarge(content):
         name = next(name for name in content["files"] if name.startswith("params/"))
         content["files"][name][0] = 10**12
 
     monkeypatch.setattr(checkpoint.reading, "verify", None)
     rewrite(path, enlarge)
-    refused(path, "bytes of params, whose leaves need .* at most")
+    refused(path, "params has 1000.* bytes")
 
 
-def test_episodes_larger_than_any_are_refused(path):
+def test_episodes_above_the_limit_are_refused(path):
     def enlarge(content):
         content["leaves"]["episodes"]["length"]["shape"] = [10**9, 10**6]
 
     rewrite(path, enlarge)
-    refused(path, "bytes of episodes, .* are allowed")
+    refused(path, f"episodes has .* bytes, .*{manifest.MAX_EPISODES_BYTES}")
 
 
-def test_small_files_do_not_unfold_into_huge_parameters(path):
+def test_small_files_do_not_expand_to_huge_parameters(path):
     def enlarge(content):
         leaves = content["leaves"]["params"]
         leaves[next(iter(leaves))]["shape"] = [10**9]
 
     rewrite(path, enlarge)
-    refused(path, "4000000.* bytes of params cannot come of")
+    refused(path, "params has 4000000")
 
 
 def test_arrays_larger_than_the_manifest_says_are_refused_before_they_are_read(
     path, monkeypatch
 ):
-    """Compressed, a few bytes stand for any number of equal ones."""
+    """A few compressed bytes can expand to any number of equal ones."""
     params = {"['bomb']": np.zeros(10_000_000, np.float32)}
     names = json.loads((path / manifest.NAME).read_bytes())["leaves"]["params"]
     for item in (params, dict.fromkeys(names, params["['bomb']"])):
@@ -132,12 +131,12 @@ def test_arrays_larger_than_the_manifest_says_are_refused_before_they_are_read(
 
         rewrite(path, describe)
         monkeypatch.setattr(arrays.ocp.Checkpointer, "restore", None)
-        refused(path, r"params': holds other arrays|params': holds .* float32\[10000000\]")
+        refused(path, r"params': holds (other arrays|.* float32\[10000000\])")
         monkeypatch.undo()
 
 
 class Payload:
-    """Unpickled, it writes a file."""
+    """Writes a file when it is unpickled."""
 
     def __init__(self, marker):
         self._marker = marker
@@ -146,7 +145,7 @@ class Payload:
         return pathlib.Path.touch, (self._marker,)
 
 
-def test_a_pickle_in_the_place_of_any_file_is_not_executed(path, tmp_path):
+def test_a_pickle_instead_of_any_file_is_not_executed(path, tmp_path):
     marker = tmp_path / "executed"
     payload = pickle.dumps(Payload(marker))
     for file in files_of(path):
@@ -155,14 +154,14 @@ def test_a_pickle_in_the_place_of_any_file_is_not_executed(path, tmp_path):
         with pytest.raises(InvalidInput):
             checkpoint.restore(path.parents[1], STATE)
         name = str(file.relative_to(path))
-        if name.startswith(("params/", "state/")):  # and where its checksum is right
+        if name.startswith(("params/", "state/")):  # also with the right checksum
 
             def describe(content, name=name):
                 content["files"][name] = [len(payload), hashlib.sha256(payload).hexdigest()]
 
             before = (path / manifest.NAME).read_bytes()
             rewrite(path, describe)
-            with contextlib.suppress(InvalidInput):  # not every file of Orbax is needed
+            with contextlib.suppress(InvalidInput):  # Orbax does not read every file
                 checkpoint.restore(path.parents[1], STATE)
             sign(path, before)
         file.write_bytes(content)
@@ -185,15 +184,15 @@ def test_a_pickle_in_the_place_of_any_file_is_not_executed(path, tmp_path):
         (b'{"schema": 1, "version": "1"', "Expecting ',' delimiter"),
     ],
 )
-def test_what_is_no_manifest_is_refused(path, text, match):
+def test_other_content_than_a_manifest_is_refused(path, text, match):
     sign(path, text)
     refused(path, match)
 
 
 def test_a_huge_manifest_is_not_read(path, monkeypatch):
     with (path / manifest.NAME).open("r+b") as file:
-        file.truncate(2**40)  # of holes, which take nothing of the disk
-    refused(path, "more than the 16777216 allowed")
+        file.truncate(2**40)  # a sparse file, which takes no space on disk
+    refused(path, "16777216")
 
 
 FIELDS = ("schema", "version", "computed", "env_steps", "config", "spec", "progress", "leaves")
@@ -213,42 +212,39 @@ def test_a_field_that_is_missing_or_of_another_kind_is_refused(path, field):
 @pytest.mark.parametrize(
     ("change", "match"),
     [
-        (lambda c: c.update(more=1), "'more' is not known"),
-        (
-            lambda c: c.update(schema=3, version="9.9"),
-            "its layout is not known; vawm 9.9 wrote it and this is vawm .*: use the one",
-        ),
+        (lambda c: c.update(more=1), "'more'"),
+        (lambda c: c.update(schema=3, version="9.9"), "schema 3.*vawm 9.9"),
         (
             lambda c: c["config"].update(colour=1) or c.update(version="9.9"),
-            r"run/checkpoints/0.*': Config\.colour=1: is not known; vawm 9.9 wrote .* --fresh",
+            r"run/checkpoints/0.*': Config\.colour=1: .*vawm 9.9.* --fresh",
         ),
-        (lambda c: c.update(env_steps=5), "holds the manifest of 5 env steps"),
-        (lambda c: c.update(env_steps=-1), "-1 is not a count|'-1' is not a count"),
-        (lambda c: c["config"].update(colour=1), r"Config\.colour=1: is not known"),
-        (lambda c: c["config"].pop("seed"), r"Config\.seed=None: was not saved"),
-        (lambda c: c["config"].update(num_envs="2"), r"num_envs='2': is of another kind"),
-        (lambda c: c["config"].update(num_envs=0), "num_envs=0: "),
-        (lambda c: c["config"].update(actor=3), "ActorConfig='3': holds no choices"),
-        (lambda c: c["config"].update(suite=["a"]), "is not known"),
+        (lambda c: c.update(env_steps=5), "5 env steps"),
+        (lambda c: c.update(env_steps=-1), "-1"),
+        (lambda c: c["config"].update(colour=1), r"Config\.colour=1"),
+        (lambda c: c["config"].pop("seed"), r"Config\.seed=None"),
+        (lambda c: c["config"].update(num_envs="2"), r"num_envs='2'"),
+        (lambda c: c["config"].update(num_envs=0), "num_envs=0"),
+        (lambda c: c["config"].update(actor=3), "ActorConfig='3'"),
+        (lambda c: c["config"].update(suite=["a"]), r"Config\.suite=\['a'\]"),
         (lambda c: c["config"]["actor"].update(units=10**20), "actor.units=10"),
-        (lambda c: c["spec"].update(more=1), "'more' is not known"),
+        (lambda c: c["spec"].update(more=1), "'more'"),
         (lambda c: c["spec"].update(num_envs="2"), "num_envs is '2'"),
-        (lambda c: c["spec"].update(obs={"shape": [-1], "dtype": "uint8"}), "not a count"),
-        (lambda c: c["spec"].update(obs={"shape": [1], "dtype": "object"}), "is not known"),
-        (lambda c: c["leaves"].update(other={}), "item 'other' is not known"),
-        (lambda c: c["leaves"].update(params=[]), "item params has no leaves"),
-        (lambda c: c["leaves"]["params"].update(x=1), "are expected"),
+        (lambda c: c["spec"].update(obs={"shape": [-1], "dtype": "uint8"}), "'-1'"),
+        (lambda c: c["spec"].update(obs={"shape": [1], "dtype": "object"}), "'object'"),
+        (lambda c: c["leaves"].update(other={}), "item 'other'"),
+        (lambda c: c["leaves"].update(params=[]), "item params"),
+        (lambda c: c["leaves"]["params"].update(x=1), "'1' .*shape, dtype"),
         (
             lambda c: c["leaves"]["params"].update(x={"shape": [], "dtype": "O", "impl": None}),
-            "dtype 'O' is not known",
+            "dtype 'O'",
         ),
-        (lambda c: c["files"].update({"params/x": "y"}), "has no size and checksum"),
-        (lambda c: c["files"].update({"params/x": [1, "y"]}), "has no checksum"),
-        (lambda c: c["files"].update({"params/x": [-1, "0" * 64]}), "not a count"),
-        (lambda c: c["files"].clear(), "is not in the manifest"),
-        (lambda c: rename(c, "params/x"), "is missing"),
+        (lambda c: c["files"].update({"params/x": "y"}), "'params/x'"),
+        (lambda c: c["files"].update({"params/x": [1, "y"]}), "'params/x'"),
+        (lambda c: c["files"].update({"params/x": [-1, "0" * 64]}), "'-1'"),
+        (lambda c: c["files"].clear(), "params/.*': is not in the manifest"),
+        (lambda c: rename(c, "params/x"), "params/x': is missing"),
     ],
 )
-def test_a_manifest_that_says_something_else_is_refused(path, change, match):
+def test_a_manifest_with_wrong_content_is_refused(path, change, match):
     rewrite(path, change)
     refused(path, match)

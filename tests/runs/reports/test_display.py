@@ -1,4 +1,4 @@
-"""What a terminal and a log file show of a run, by a clock that the tests move."""
+"""The progress display on a terminal and in a log file, with a fake clock."""
 
 import io
 import re
@@ -31,7 +31,7 @@ def console(clock, *, terminal):
 
 
 def text(console):
-    """What was written, without the control codes of a terminal."""
+    """The written text, without the control codes of a terminal."""
     return CONTROL.sub("", console.file.getvalue())
 
 
@@ -56,7 +56,7 @@ def play(display, clock, *, seconds, chunks=3, start=0):
         display.advance(start + 1_000 * chunk, interval(seconds))
 
 
-def test_a_terminal_shows_where_the_run_is_how_fast_and_how_long_still(clock):
+def test_a_terminal_shows_progress_speed_and_remaining_time(clock):
     shown = console(clock, terminal=True)
     with Display(shown, start=0, total=10_000) as display:
         display.log(line(1_000, 12.34))
@@ -86,7 +86,7 @@ def test_chunks_of_any_length_give_an_eta_and_compiling_does_not_count(clock, se
     assert text(shown).rstrip().endswith(remaining)
 
 
-def test_the_eta_of_a_resumed_run_is_about_what_is_left(clock):
+def test_the_eta_of_a_resumed_run_covers_the_remaining_steps(clock):
     shown = console(clock, terminal=True)
     with Display(shown, start=5_000, total=10_000) as display:
         play(display, clock, seconds=2.0, start=5_000)
@@ -102,7 +102,7 @@ def test_a_finished_run_is_not_shown_beyond_its_end(clock):
     assert "2,500/2,500 env steps" in text(shown).splitlines()[-1]
 
 
-def test_elsewhere_every_line_of_metrics_is_a_line(clock):
+def test_a_log_file_has_one_line_per_line_of_metrics(clock):
     shown = console(clock, terminal=False)
     with Display(shown, start=0, total=10_000) as display:
         display.note("compiling [1/2] ...")

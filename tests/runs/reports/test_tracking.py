@@ -41,7 +41,7 @@ def add_all(*chunks):
     return interval
 
 
-def test_a_line_weighs_each_chunk_by_its_updates():
+def test_a_line_weights_each_chunk_by_its_updates():
     line = closed(add_all(chunk(1, 5.0), chunk(3, 1.0), chunk(0, math.nan)))
     assert line["loss/critic"] == (1 * 5.0 + 3 * 1.0) / 4
     assert line["updates_per_s"] == pytest.approx(4 / 1.5, abs=1e-3)
@@ -57,7 +57,7 @@ def test_episode_metrics_are_means_over_finished_episodes():
     assert line["env/nonfinite"] == 2
 
 
-def test_what_did_not_happen_is_null():
+def test_means_without_samples_are_null():
     line = closed(add_all(chunk(0, math.nan)))
     assert line["episode/return"] is None
     assert line["loss/critic"] is None
@@ -84,7 +84,7 @@ def test_truncation_drops_later_lines_and_half_a_line(tmp_path):
     assert path.read_text() == '{"env_steps": 1}\n{"env_steps": 2}\n'
 
 
-def test_a_truncation_that_meets_a_full_disk_leaves_the_file_as_it_was(tmp_path, monkeypatch):
+def test_a_truncation_on_a_full_disk_leaves_the_file_unchanged(tmp_path, monkeypatch):
     def full(_):
         raise OSError(28, "No space left on device")
 
@@ -96,7 +96,7 @@ def test_a_truncation_that_meets_a_full_disk_leaves_the_file_as_it_was(tmp_path,
     assert (path.read_text(), list(tmp_path.iterdir())) == (text, [path])
 
 
-def test_truncation_of_nothing_is_nothing(tmp_path):
+def test_truncating_a_missing_file_does_nothing(tmp_path):
     assert tracking.truncate(tmp_path / "metrics.jsonl", 2) == 0
     assert not list(tmp_path.iterdir())
     assert tracking.read(tmp_path / "metrics.jsonl") == []
@@ -106,14 +106,14 @@ def test_truncation_of_nothing_is_nothing(tmp_path):
     "damage",
     [b'{"env_steps": 2', b"\0\0\0", b"\xff\xfe", b"null", b"7", b'{"a": 1}', b"[" * 99_999],
 )
-def test_a_damaged_line_is_left_out_and_counted_and_the_later_ones_stay(tmp_path, damage):
+def test_a_damaged_line_is_dropped_and_counted_and_later_ones_stay(tmp_path, damage):
     path = tmp_path / "metrics.jsonl"
     whole = [b'{"env_steps": %d}\n' % env_steps for env_steps in (1, 3, 4, 5)]
     path.write_bytes(
         b"".join([whole[0], damage + b"\n", *whole[1:3], damage + b"\n", whole[3]])
     )
     assert [line["env_steps"] for line in tracking.read(path)] == [1, 3, 4, 5]
-    assert tracking.truncate(path, 4) == 1  # the other is later than what stays
+    assert tracking.truncate(path, 4) == 1  # the other one is after the last line kept
     assert path.read_bytes() == b"".join(whole[:3])
     assert tracking.truncate(path, 4) == 0
 
@@ -140,7 +140,7 @@ def test_tensorboard_purges_from_the_step_after_the_last_that_is_kept(tmp_path):
 
 @pytest.mark.skipif(not pathlib.Path("/dev/full").exists(), reason="needs /dev/full")
 @pytest.mark.parametrize("name", ["metrics.jsonl", "events"])
-def test_a_full_disk_is_an_error_of_the_line_that_meets_it(tmp_path, monkeypatch, name):
+def test_a_full_disk_is_an_error_when_a_line_is_written(tmp_path, monkeypatch, name):
     if name == "events":
         monkeypatch.setattr(tracking, "RecordWriter", lambda _: RecordWriter("/dev/full"))
     else:
@@ -179,7 +179,7 @@ def test_videos_are_files_lines_and_events(tmp_path):
     assert image.encoded_image_string == (tmp_path / "videos" / names[0]).read_bytes()
 
 
-def test_a_resumed_run_shows_the_videos_again_that_tensorboard_dropped(tmp_path):
+def test_a_resumed_run_sends_tensorboard_the_videos_that_it_dropped(tmp_path):
     with tracking.Tracker(tmp_path) as tracker:
         for env_steps in (40, 80, 90):
             tracker.write_videos([film()], env_steps=env_steps)
@@ -195,7 +195,7 @@ def test_a_resumed_run_shows_the_videos_again_that_tensorboard_dropped(tmp_path)
     assert value.image.encoded_image_string == gif
 
 
-def test_a_video_that_cannot_be_written_leaves_no_half(tmp_path, monkeypatch):
+def test_a_video_that_cannot_be_written_leaves_no_file(tmp_path, monkeypatch):
     def full(*_):
         raise OSError(errno.ENOSPC, "No space left on device")
 

@@ -1,4 +1,4 @@
-"""Videos: how frames are put together, which episode is shown, and that GIFs are GIFs."""
+"""Videos: composed frames, the episode that is shown, and GIF files."""
 
 import io
 
@@ -13,7 +13,7 @@ def sequences(value, batch=2, length=4):
     return np.full((batch, length, 8, 8, 3), value, np.uint8)
 
 
-def test_truth_prediction_and_error_stand_one_above_the_other():
+def test_truth_prediction_and_error_are_stacked():
     truth = sequences(51)  # 0.2
     predicted = np.full((2, 4, 8, 8, 3), 0.6)
     same = np.ones((2, 4), bool)
@@ -28,7 +28,7 @@ def test_truth_prediction_and_error_stand_one_above_the_other():
     assert made.numbers["context"] == 1
 
 
-def test_the_border_says_what_the_model_sees():
+def test_the_border_colour_shows_whether_the_model_observes():
     frames = video.open_loop_video(
         sequences(0), np.zeros((2, 4, 8, 8, 3)), np.ones((2, 4), bool), context=2
     ).frames
@@ -37,7 +37,7 @@ def test_the_border_says_what_the_model_sees():
     assert (corners[2:] == video.IMAGINED).all()
 
 
-def test_errors_leave_out_what_a_reset_has_cut():
+def test_errors_exclude_sequences_after_a_reset():
     truth, predicted = sequences(0), np.zeros((2, 4, 8, 8, 3))
     predicted[0] = 1.0
     same = np.array([[True, True, False, False], [True, True, True, False]])
@@ -45,20 +45,20 @@ def test_errors_leave_out_what_a_reset_has_cut():
     assert numbers["error"] == [0.5, 0.5, 0.0, None]
 
 
-def test_a_prediction_that_is_not_finite_is_no_number():
+def test_the_error_of_a_prediction_that_is_not_finite_is_none():
     predicted = np.full((2, 4, 8, 8, 3), np.nan)
     made = video.open_loop_video(sequences(0), predicted, np.ones((2, 4), bool), context=1)
     assert made.numbers["error"] == [None] * 4
 
 
-def test_the_error_is_that_of_what_was_predicted_in_all_channels():
+def test_the_error_is_computed_before_rounding_over_all_channels():
     truth = np.concatenate([sequences(0), sequences(255)[..., :1]], -1)
-    predicted = np.full((2, 4, 8, 8, 4), 0.001)  # less than a byte tells apart
+    predicted = np.full((2, 4, 8, 8, 4), 0.001)  # less than one level of a byte
     made = video.open_loop_video(truth, predicted, np.ones((2, 4), bool), context=1)
     assert made.numbers["error"] == pytest.approx([(3 * 0.001**2 + 0.999**2) / 4] * 4)
 
 
-def test_images_of_a_mixture_are_shown_side_by_side_and_grey_as_grey():
+def test_images_of_mixed_observations_are_shown_side_by_side():
     obs = {
         "a": sequences(9),
         "b": np.zeros((2, 4, 3), np.float32),
@@ -80,16 +80,16 @@ def flags(length, *places):
     ("first", "last", "head", "size", "expected"),
     [
         ([0], [3], 6, 6, [0, 1, 2, 3]),
-        ([0, 4], [3], 8, 8, [0, 1, 2, 3]),  # the running episode is not whole
+        ([0, 4], [3], 8, 8, [0, 1, 2, 3]),  # the running episode is incomplete
         ([0, 3], [2, 5], 6, 6, [3, 4, 5]),  # the newest
-        ([], [2, 5], 6, 6, None),  # its beginning is overwritten
+        ([], [2, 5], 6, 6, None),  # its start is overwritten
         ([1], [0], 6, 6, None),
-        ([0, 2], [4], 6, 6, [2, 3, 4]),  # the first one was cut short by a reset
+        ([0, 2], [4], 6, 6, [2, 3, 4]),  # a reset ended the first one early
         ([6], [1], 4, 8, [6, 7, 0, 1]),  # across the end of the ring
         ([0], [3], 0, 0, None),
     ],
 )
-def test_the_newest_whole_episode_is_found(first, last, head, size, expected):
+def test_the_newest_complete_episode_is_found(first, last, head, size, expected):
     actual = video.last_episode(flags(8, *first), flags(8, *last), head=head, size=size)
     assert (None if actual is None else actual.tolist()) == expected
 

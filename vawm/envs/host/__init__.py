@@ -1,13 +1,13 @@
-"""Environments that run on the host: real simulators in processes of their own.
+"""Environments that run on the host: simulators in separate processes.
 
-    simulator          what one environment is
-    pool               many of them, stepped side by side; failures, resuming
-    crew, worker       the processes that run them, and what each of them does
-    channel            messages and memory between processes
+    simulator          the interface of one environment
+    pool               many environments, stepped in parallel; failures, resuming
+    crew, worker       the processes that run them, and the code of one such process
+    channel            messages and shared memory between processes
     gymnasium          any Gymnasium environment as a simulator
-    gymnasium_check    what has to hold of it
+    gymnasium_check    the requirements for a Gymnasium environment
     atari, frames      a game of the Arcade Learning Environment, and its pixels
-    vision, rendering  a task of the DeepMind Control Suite from pixels, without a screen
+    vision, rendering  a task of the DeepMind Control Suite from pixels, without a display
 
 Nothing here initialises JAX.
 """

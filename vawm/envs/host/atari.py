@@ -1,11 +1,13 @@
-"""The 26 games of Atari 100k, played on the Arcade Learning Environment itself.
+"""The 26 games of Atari 100k, played on the Arcade Learning Environment (ALE).
 
-The semantics are DreamerV3's, with these differences. The time limit cuts a game and does
-not end it. An observation never shows frames of before the reset or the step. Every reset
-leads to the same game: ALE's own leaves the console's memory and random numbers as they were,
-and in at least ten of the games what follows depends on them. Sticky frames are drawn here and
-not by ALE, from the seed of the episode. And the last life of bank_heist, which counts as 0, is
-a life.
+The semantics are DreamerV3's, with these differences:
+
+- The time limit truncates an episode; it does not terminate it.
+- An observation never shows frames from before the reset or the step.
+- Every reset leads to the same game. ALE's reset keeps the console's memory and random
+  numbers, and at least ten of the games depend on them.
+- Sticky frames are drawn here from the episode's seed, not by ALE.
+- The last life of bank_heist, which counts as 0, is a life.
 """
 
 from __future__ import annotations
@@ -48,36 +50,37 @@ GAMES = {
     "seaquest": "Seaquest",
     "up_n_down": "UpNDown",
 }
-"""Name of the ROM -> name in tables of scores."""
+"""Name of the ROM -> name in score tables."""
 
 LIFE_LOSSES = ("ignore", "terminal", "end")
-NOOP = 0  # ALE's number of the action that does nothing, in every game
+NOOP = 0  # ALE's number for the action that does nothing, in every game
 
 
 class AtariSimulator:
     """One game as a `Simulator`; observations are `[image_size, image_size, 3]` uint8.
 
-    An observation is the maximum of the last frames of a step at full resolution, made
-    smaller. The first one is the screen after the no-ops, alone; a step that is cut short
-    has fewer frames to choose from.
+    An observation is the pixelwise maximum over the last `pooling` frames of a step at full
+    resolution, resized. The first observation is the one screen after the no-ops. A step
+    that ends early has fewer frames.
 
     Args:
       game: one of `GAMES`.
-      frame_skip: frames that a step plays, fewer where the episode ends among them.
-      pooling: frames at the end of a step of which the maximum is seen, at most those of
-        the step.
-      image_size: pixels a side.
-      resize: "bilinear" as Pillow, "area" as OpenCV; see `make_resize`.
-      noops: an episode begins with a random number of frames without action, 0 to this
-        many, drawn from its seed. They count neither as steps nor for `max_frames`.
+      frame_skip: frames per step; fewer if the episode ends within the step.
+      pooling: number of frames at the end of a step to take the maximum over, at most those
+        of the step.
+      image_size: pixels per side.
+      resize: "bilinear" as in Pillow, "area" as in OpenCV; see `make_resize`.
+      noops: an episode starts with a random number of frames without action, 0 to `noops`,
+        drawn from its seed. They count neither as steps nor for `max_frames`.
       sticky: probability that a frame repeats the action of the frame before, in [0, 1).
-      life_loss: what losing a life does where the game goes on. "ignore": nothing.
+      life_loss: what the loss of a life does if the game continues. "ignore": nothing.
         "terminal": the step stops at that frame, `is_terminal` without `is_last`. "end":
-        the episode ends at that frame, and the next reset begins a new game, not the rest
-        of this one, which would depend on what was played before.
-      clip_reward: only the sign of a step's reward is given.
-      max_frames: of an episode, which then is cut: `is_last` without `is_terminal`.
-      full_action_set: all 18 actions, not only those that do something in the game.
+        the episode ends at that frame, and the next reset starts a new game. (The rest of
+        this game would depend on earlier actions.)
+      clip_reward: return only the sign of a step's reward.
+      max_frames: truncate an episode after this many frames: `is_last` without
+        `is_terminal`.
+      full_action_set: use all 18 actions, not only those with an effect in the game.
 
     Raises:
       InvalidInput: an unknown game or choice, an impossible number, or no ale-py.
@@ -111,7 +114,8 @@ class AtariSimulator:
         if isinstance(noops, bool) or not isinstance(noops, int) or noops < 0:
             raise InvalidInput("noops", noops, "use a whole number of at least 0")
         if not 0 <= sticky < 1:
-            raise InvalidInput("sticky", sticky, "use a probability below 1, 0 for none")
+            remedy = "use a probability of at least 0 and below 1"
+            raise InvalidInput("sticky", sticky, remedy)
         if life_loss not in LIFE_LOSSES:
             remedy = f"choose one of {', '.join(LIFE_LOSSES)}"
             raise InvalidInput("life_loss", life_loss, remedy)
@@ -133,7 +137,7 @@ class AtariSimulator:
         self.action_size = len(self._actions)
 
     def reset(self, seed: int) -> np.ndarray:
-        """Begins the game of this seed: its no-ops and its sticky frames."""
+        """Starts a game; `seed` decides its no-ops and its sticky frames."""
         self._random = np.random.default_rng(seed)
         self._restart()
         for _ in range(self._random.integers(self._noops + 1)):
@@ -147,7 +151,7 @@ class AtariSimulator:
         return self._resize(self._screens[0])
 
     def step(self, action: np.ndarray | int) -> Outcome:
-        """Plays the action of this index for a frame skip."""
+        """Plays the action with this index for `frame_skip` frames."""
         if not 0 <= int(action) < self.action_size:
             remedy = f"use the index of an action, 0 to {self.action_size - 1}"
             raise InvalidInput("action", action, remedy)
@@ -163,7 +167,7 @@ class AtariSimulator:
             self._frames += 1
             over = self._over()
             lives = self._ale.lives()
-            # Not "and still above 0": the last life of bank_heist counts as 0.
+            # No check for lives > 0: the last life of bank_heist counts as 0.
             lost = lives < self._lives and not over
             self._lives = lives
             ended = over or (lost and self._life_loss == "end")
@@ -177,15 +181,15 @@ class AtariSimulator:
         )
 
     def close(self) -> None:
-        """Lets go of the console."""
+        """Frees the console."""
         self._ale = self._loaded = None
 
     def _restart(self) -> None:
-        """Begins the one game there is.
+        """Starts the game that loading the ROM and one reset lead to.
 
-        A saved state lacks parts of the video chip and the screen, and a reset lacks the
-        memory, the cartridge and the random numbers of the console: the one after the other
-        misses nothing. It leads to the game that loading and one reset lead to.
+        A saved state does not contain all of the video chip and the screen; a reset does not
+        restore the memory, the cartridge and the random numbers of the console. Both
+        together restore everything.
         """
         self._ale.restoreState(self._loaded)
         self._ale.reset_game()
@@ -195,7 +199,7 @@ class AtariSimulator:
 
 
 def check_game(name: str) -> None:
-    """Refuses a name outside `GAMES`, with the nearest one."""
+    """Refuses a name outside `GAMES` and suggests the nearest one."""
     if name in GAMES:
         return
     remedy = f"{suggestion(name, GAMES)}choose one of {', '.join(GAMES)}"
@@ -203,22 +207,22 @@ def check_game(name: str) -> None:
 
 
 def load(game: str) -> Any:
-    """An `ALEInterface` with the game just loaded, silent but for errors.
+    """An `ALEInterface` with the game loaded; logs errors only.
 
-    ALE's own sticky actions are off: their random numbers are not ours to seed by episode.
-    Frame skip 1, no time limit, no end at a lost life and the game's usual mode and
-    difficulty are ALE's defaults.
+    ALE's sticky actions are off, because their random numbers cannot be seeded per episode.
+    ALE's defaults are frame skip 1, no time limit, no end at a lost life, and the game's
+    usual mode and difficulty.
     """
     try:
         import ale_py
         from ale_py import roms
     except ImportError as missing:
-        remedy = 'Atari needs ale-py: pip install "vawm[atari]"'
+        remedy = 'ale-py is not installed: pip install "vawm[atari]"'
         raise InvalidInput("game", game, remedy) from missing
 
     ale_py.ALEInterface.setLoggerMode(ale_py.LoggerMode.Error)
     ale = ale_py.ALEInterface()
     ale.setFloat("repeat_action_probability", 0.0)
-    ale.setInt("random_seed", 0)  # else the clock
+    ale.setInt("random_seed", 0)  # the default seed is the clock
     ale.loadROM(str(roms.get_rom_path(game)))
     return ale

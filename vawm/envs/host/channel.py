@@ -1,4 +1,4 @@
-"""What passes between a pool and its workers: messages, and arrays in memory of both."""
+"""Communication between a pool and its workers: messages, and arrays in shared memory."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ Fields = Mapping[str, tuple[tuple[int, ...], Any]]
 """Name of an array -> shape and dtype."""
 
 LENGTH = struct.Struct("<Q")
-ALIGNMENT = 64  # bytes, a cache line: workers write their rows side by side
+ALIGNMENT = 64  # bytes, one cache line
 
 
 class Channel:
-    """Messages over a connected socket, pickled; every wait can have an end.
+    """Pickled messages over a connected socket; every wait can have a timeout.
 
-    Both ends are ours: a process and the one that started it.
+    The two ends are a process and the one that started it, so unpickling is safe.
     """
 
     def __init__(self, end: socket.socket):
@@ -41,7 +41,7 @@ class Channel:
         """Sends a message.
 
         Raises:
-          OSError: the other end is gone, or takes nothing for `timeout` seconds.
+          OSError: the other end is closed, or accepts nothing for `timeout` seconds.
         """
         body = pickle.dumps(message, protocol=pickle.HIGHEST_PROTOCOL)
         rest = memoryview(LENGTH.pack(len(body)) + body)
@@ -54,19 +54,19 @@ class Channel:
                     raise TimeoutError from None
 
     def receive(self, *, deadline: float | None = None) -> Any:
-        """Waits for a message; what arrived of one is kept when time is up.
+        """Waits for a message; keeps a partly received one if time is up.
 
         Args:
-          deadline: of `time.monotonic()`. What has arrived by then is returned, however
-            late the call is made.
+          deadline: in terms of `time.monotonic()`. A message that has already arrived is
+            returned even after the deadline.
 
         Raises:
-          TimeoutError: nothing whole by the deadline.
-          EOFError: the other end is gone.
+          TimeoutError: no complete message by the deadline.
+          EOFError: the other end is closed.
         """
         while (message := self._next()) is None:
             wait = None if deadline is None else 1000 * max(0, deadline - time.monotonic())
-            if self._end.fileno() < 0:  # closed here; its number may be another's by now
+            if self._end.fileno() < 0:  # closed here; its descriptor may be reused by now
                 raise EOFError
             if not self._readable.poll(wait):
                 raise TimeoutError
@@ -80,7 +80,7 @@ class Channel:
         return message[0]
 
     def _next(self) -> tuple[Any] | None:
-        """The first message that has arrived whole, in a tuple of its own."""
+        """The first complete message, in a 1-tuple; None if there is none."""
         if len(self._arrived) < LENGTH.size:
             return None
         end = LENGTH.size + LENGTH.unpack_from(self._arrived)[0]
@@ -95,7 +95,7 @@ class Channel:
 
 
 def create_file() -> int:
-    """A descriptor of an empty file in memory, without a name that could be left behind."""
+    """Opens an empty file in memory, without a name, so that nothing is left behind."""
     if hasattr(os, "memfd_create"):
         try:
             return os.memfd_create("vawm")
@@ -108,10 +108,10 @@ def create_file() -> int:
 
 
 def reserve(file: int, fields: Fields) -> None:
-    """Makes room for `fields`.
+    """Allocates space for `fields` in the file.
 
     Raises:
-      OSError: there is none; writing to a file without room would be a bus error.
+      OSError: there is not enough; writing without it would be a bus error.
     """
     size = _place(fields)[1]
     if hasattr(os, "posix_fallocate"):
@@ -121,8 +121,10 @@ def reserve(file: int, fields: Fields) -> None:
 
 
 def view(file: int, fields: Fields) -> dict[str, np.ndarray]:
-    """Arrays in the file, in the order of `fields`; who views the first ones only sees the
-    same. What one process writes, all read."""
+    """Arrays in the file, in the order of `fields`, shared by all processes.
+
+    A view of only the first fields has the same arrays at the same place.
+    """
     offsets, size = _place(fields)
     memory = mmap.mmap(file, size)
     return {
@@ -132,7 +134,7 @@ def view(file: int, fields: Fields) -> dict[str, np.ndarray]:
 
 
 def _place(fields: Fields) -> tuple[dict[str, int], int]:
-    """Offsets of the arrays, and the size of all."""
+    """The offset of each array, and the total size, in bytes."""
     offsets, size = {}, 0
     for name, (shape, dtype) in fields.items():
         offsets[name] = size

@@ -1,7 +1,7 @@
-"""The workers of a pool: started, given orders, heard, and ended.
+"""The workers of a pool: starts them, sends them orders, collects answers, ends them.
 
-A worker that dies or hangs shows as `Trouble` of all its environments. No wait is without
-end: a call of a simulator may take so many seconds, then its worker is killed.
+If a worker dies or hangs, each of its environments gets a `Trouble`. Every wait has a limit:
+if a call of a simulator takes longer than `timeout`, its worker is killed.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ from vawm.envs.host.worker import (
 from vawm.errors import InvalidInput
 
 TELL_SECONDS = 0.5
-"""For a process that hangs to say where."""
+"""Time for a hanging process to report its traceback."""
 DEATH_SECONDS = 5.0
-"""For a killed process to be gone; one that waits for a device takes longer, unattended."""
+"""Time for a killed process to end. One that waits for a device takes longer; it is left."""
 CLOSE_SECONDS = 5.0
-"""For simulators to close in order, such as to finish a video."""
+"""Time for simulators to close properly, for example to finish a video."""
 BOOT = (
     "import json, sys; sys.path[:] = json.loads(sys.argv[1]); "
     "from vawm.envs.host.worker import main; main()"
@@ -46,15 +46,15 @@ BOOT = (
 
 
 class Handle:
-    """One worker, as the pool's process sees it.
+    """The pool's side of one worker.
 
     Attributes:
-      index: among the workers; worker w of W runs the environments w, w + W, ...
-      envs: those.
-      ready: whether it has all its simulators. Never again after `kill`.
-      channel: to it.
-      process: leads a process group of its own. So Ctrl-C in a terminal does not reach it,
-        and what a simulator started ends with it.
+      index: among the workers; worker w of W runs environments w, w + W, ...
+      envs: the environments it runs.
+      ready: whether it has all its simulators; False after `kill`.
+      channel: to the worker.
+      process: the worker. It leads its own process group, so Ctrl-C in a terminal does not
+        reach it, and processes that a simulator started end with it.
     """
 
     def __init__(self, index: int, workers: int, num_envs: int, memory: int):
@@ -74,15 +74,15 @@ class Handle:
             "parent": os.getpid(),
             "by_kernel": threading.current_thread() is threading.main_thread(),
         }
-        # A script's own folder may be on the path, or a notebook's: "".
+        # "" on the path means the current folder, for example of a notebook.
         path = [folder or os.getcwd() for folder in sys.path if isinstance(folder, str)]
-        options = "-uP"  # shows what is printed at once; adds no folder to the path
+        options = "-uP"  # -u: print without buffering; -P: add no folder to the path
         command = [sys.executable, options, "-c", BOOT, json.dumps(path), json.dumps(settings)]
         try:
             self.process = subprocess.Popen(
                 command,
                 stdin=subprocess.DEVNULL,
-                stdout=standard_error(),  # standard output is for what the run prints
+                stdout=standard_error(),  # keep standard output for the run itself
                 pass_fds=(theirs.fileno(), memory, self._crash),
                 process_group=0,
                 env=variables(),
@@ -94,7 +94,7 @@ class Handle:
             theirs.close()
 
     def where(self) -> str:
-        """Has a worker that does not answer say where it is: a traceback, or ""."""
+        """Asks a worker that does not answer for its traceback; "" if it sends none."""
         with contextlib.suppress(OSError):
             os.kill(self.process.pid, TELL)
         end = time.monotonic() + TELL_SECONDS
@@ -103,14 +103,14 @@ class Handle:
         return said
 
     def last_words(self) -> str:
-        """What the interpreter wrote when it crashed or was asked."""
+        """The traceback that the interpreter wrote after a crash or on request."""
         return os.pread(self._crash, 1 << 16, 0).decode(errors="replace")
 
     def kill(self) -> str:
-        """Ends the process and what it started; returns how it ended.
+        """Kills the process and what it started; returns how it ended.
 
-        One that had ended by itself keeps its own exit code: it is not waited for before, so
-        that its number cannot be another's yet.
+        A process that had already ended keeps its exit code. It was not waited for before,
+        so its process id cannot have been reused yet.
         """
         if self._crash < 0:
             return ""
@@ -121,7 +121,7 @@ class Handle:
         self._release()
         code = self.process.returncode
         if code is None:
-            return "does not end"
+            return "did not end when killed"
         if code >= 0:
             return f"exited with code {code}"
         names = {number.value: number.name for number in signal.Signals}
@@ -143,11 +143,11 @@ class Crew:
     """
 
     def __init__(self, num_envs: int, workers: int, timeout: float):
-        """Starts nothing yet.
+        """Prepares the workers; starts none yet.
 
         Args:
           num_envs: N, over all workers.
-          workers: how many; 0 for as many as there are cores. Never more than N.
+          workers: number of workers; 0 for one per core. Never more than N.
           timeout: seconds that a call of a simulator may take.
         """
         self.size = min(num_envs, workers or cores())
@@ -162,19 +162,19 @@ class Crew:
 
     @property
     def closed(self) -> bool:
-        """Whether they have ended for good."""
+        """Whether the crew has been closed."""
         return not self._stop.alive
 
     def share(self, fields: Fields) -> dict[str, np.ndarray]:
-        """Arrays in memory of all; `fields` begin with those shared before."""
+        """Arrays in shared memory; `fields` must start with those shared before."""
         reserve(self._file, fields)
         return view(self._file, fields)
 
     def start_missing(self) -> list[int]:
-        """Starts a worker where there is none or a lost one.
+        """Starts every worker that is missing or lost.
 
         Returns:
-          Environments that have no simulator yet, see `build`.
+          The environments of the new workers: they have no simulator yet, see `build`.
         """
         empty: list[int] = []
         for index in range(self.size):
@@ -192,12 +192,12 @@ class Crew:
     def tell(
         self, name: str, payloads: Mapping[int, Any], *, timeout: float | None = None
     ) -> None:
-        """Gives an order to the workers of some environments; `hear` waits for it.
+        """Sends an order to the workers of some environments; `hear` waits for the answers.
 
         Args:
-          name: of a method of `Worker`.
+          name: a method of `Worker`.
           payloads: environment -> its argument.
-          timeout: in which a worker has to take it, in place of the usual one.
+          timeout: seconds in which a worker must accept the order; default `self.timeout`.
         """
         self._ticket += 1
         self._told = []
@@ -205,19 +205,19 @@ class Crew:
             part = {env: payloads[env] for env in handle.envs if env in payloads}
             if part:
                 self._told.append(handle)
-                with contextlib.suppress(OSError):  # `hear` finds out why
+                with contextlib.suppress(OSError):  # `hear` finds the cause
                     order = self._ticket, name, part
                     handle.channel.send(order, timeout=timeout or self.timeout)
 
     def hear(
         self, *, timeout: float | None = None
     ) -> tuple[dict[int, Any], dict[int, Trouble]]:
-        """What the environments returned to the last order, and what went wrong.
+        """Returns the results of the last order, and the troubles, by environment.
 
-        Answers to earlier orders, whose wait was interrupted, are passed over.
+        Skips answers to earlier orders that were interrupted before they were collected.
 
         Args:
-          timeout: of each call of a simulator, in place of the usual one.
+          timeout: seconds for each call of a simulator; default `self.timeout`.
         """
         timeout = self.timeout if timeout is None else timeout
         deadline = time.monotonic() + timeout
@@ -241,7 +241,7 @@ class Crew:
     def build(
         self, factories: Mapping[int, bytes], *, timeout: float
     ) -> tuple[dict[int, Description], dict[int, Trouble]]:
-        """Makes simulators; returns what `hear` does, every failure marked as one to build."""
+        """Makes simulators; returns the same as `hear`, all troubles with `building=True`."""
         self.tell("build", factories, timeout=timeout)
         results, troubles = self.hear(timeout=timeout)
         for handle in self._told:
@@ -254,21 +254,21 @@ class Crew:
         }
 
     def discard(self, envs: Collection[int]) -> dict[int, Trouble]:
-        """Lets go of simulators, before others take their place.
+        """Closes simulators before they are replaced.
 
         Returns:
-          Environments that were lost with a worker, where closing one ended or hung it.
+          Troubles of the environments whose worker died or hung while closing one.
         """
         alive = [env for handle in self._handles if handle.ready for env in handle.envs]
         self.tell("close", {env: None for env in alive if env in envs})
         return self.hear()[1]
 
     def close(self) -> None:
-        """Lets the simulators close and ends all workers; a second call does nothing."""
+        """Closes the simulators and ends all workers; a second call does nothing."""
         if self.closed:
             return
         try:
-            # Only where nothing is known to be wrong: nobody waits for the others.
+            # Only ready workers: nobody should wait for broken ones.
             envs = [env for handle in self._handles if handle.ready for env in handle.envs]
             deadline = time.monotonic() + min(CLOSE_SECONDS, self.timeout)
             self.tell("close", dict.fromkeys(envs))
@@ -283,14 +283,14 @@ class Crew:
         """The worker's answer to the last order.
 
         Raises:
-          TimeoutError: the call that is under way takes too long.
-          EOFError: it died.
+          TimeoutError: the current call takes too long.
+          EOFError: the worker died.
         """
         while True:
             try:
                 answer = handle.channel.receive(deadline=deadline)
             except TimeoutError:
-                # The call may have begun after others, or after the wait did.
+                # The current call may have started after others, or after this wait.
                 deadline = float(self._control["began"][handle.index]) + timeout
                 if deadline <= time.monotonic():
                     raise
@@ -299,7 +299,7 @@ class Crew:
                 return answer
 
     def _lost(self, handle: Handle, reason: str, said: str) -> dict[int, Trouble]:
-        """A worker that is no more, as trouble of its environments."""
+        """The troubles of a lost worker's environments."""
         guilty = int(self._control["environment"][handle.index])
         if guilty == IDLE:
             if len(handle.envs) > 1:
@@ -309,7 +309,7 @@ class Crew:
 
 
 def stop(handles: list[Handle], file: int, owner: int) -> None:
-    """Ends the workers; not in a process that was forked from the one they belong to."""
+    """Ends the workers, unless this process was forked from the one that owns them."""
     if os.getpid() == owner:
         for handle in handles:
             handle.kill()
@@ -317,14 +317,14 @@ def stop(handles: list[Handle], file: int, owner: int) -> None:
 
 
 def cores() -> int:
-    """Cores that this process may use."""
+    """Number of cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def standard_error() -> int:
-    """The descriptor of standard error, or of nothing where it is closed."""
+    """The descriptor of standard error, or DEVNULL if it is closed."""
     try:
         os.fstat(2)
     except OSError:
@@ -342,15 +342,15 @@ def variables() -> dict[str, str]:
 
 
 def pickled(make: Callable[[], Any]) -> bytes:
-    """A factory as a worker reads it: lambdas, closures and a script's own code included.
+    """Pickles a factory for a worker, including lambdas, closures and code of a script.
 
     Raises:
-      InvalidInput: it holds on to something that cannot leave this process.
+      InvalidInput: it refers to an object that cannot be pickled.
     """
     import cloudpickle
 
     try:
         return cloudpickle.dumps(make)
     except Exception as error:
-        remedy = f"make everything inside of it, it cannot be sent: {one_line(error)}"
+        remedy = f"cannot be pickled ({one_line(error)}); create all objects inside of it"
         raise InvalidInput("make", make, remedy) from None

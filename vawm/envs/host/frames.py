@@ -1,8 +1,8 @@
-"""Screens made smaller, byte for byte as Pillow or OpenCV do it, without either.
+"""Resizes screens, byte for byte as Pillow or OpenCV would, without either.
 
-Both weigh rows and columns apart with weights that never change, so a resize is two
-products with sparse matrices: faster than Pillow, and no threads that workers would fight
-for.
+Both weight rows and columns separately with constant weights, so a resize is two products
+with sparse matrices. That is faster than Pillow and starts no threads that would compete
+with those of other workers.
 """
 
 from __future__ import annotations
@@ -15,33 +15,32 @@ from scipy import sparse
 from vawm.errors import InvalidInput
 
 RESIZES = ("bilinear", "area")
-SCREEN_WIDTH = 160  # of ALE in every game; a screen is higher than wide
-PRECISION = 22  # bits after the point in Pillow's weights of 8-bit images
+SCREEN_WIDTH = 160  # pixels, of ALE in every game; a screen is taller than wide
+PRECISION = 22  # fractional bits of Pillow's weights for 8-bit images
 
 
 def make_resize(
     method: str, *, height: int, width: int, size: int
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """Builds the function that brings RGB frames to `size` x `size` pixels.
+    """Builds the function that resizes RGB frames to `size` x `size` pixels.
 
-    bilinear: Pillow's `Image.resize(..., BILINEAR)`. A triangle as wide as the reduction
-      asks for (antialiased), across and then down, rounded to bytes after each, all in
-      fixed point: exact.
-    area: OpenCV's `INTER_AREA`. The mean over the area that a pixel covers, rounded once.
-      Exact for 160 x 210 to 64 x 64, where it cannot fall on a half: it is a multiple of
-      1 / 525. At sizes where it can, OpenCV's float32 decides and may differ by 1.
+    bilinear: Pillow's `Image.resize(..., BILINEAR)`. An antialiased triangle filter, first
+      across, then down, rounded to bytes after each, in fixed point. Exact.
+    area: OpenCV's `INTER_AREA`. The mean over the area of a new pixel, rounded once. Exact
+      for 160 x 210 to 64 x 64: means are multiples of 1 / 525, so none lies halfway between
+      two bytes. At sizes where one does, OpenCV's float32 rounding may differ by 1.
 
     Args:
       method: one of `RESIZES`.
       height: rows of a frame.
       width: pixels in a row of a frame.
-      size: pixels a side of the result.
+      size: pixels per side of the result.
 
     Returns:
       `(frame [height, width, 3] uint8) -> [size, size, 3] uint8`, a fresh array.
 
     Raises:
-      InvalidInput: an unknown method, or "area" asked to enlarge (OpenCV interpolates then).
+      InvalidInput: an unknown method, or "area" with a larger size (OpenCV interpolates).
     """
     if method not in RESIZES:
         raise InvalidInput("resize", method, f"choose one of {', '.join(RESIZES)}")
@@ -51,7 +50,7 @@ def make_resize(
     between = to_byte if method == "bilinear" else unchanged
     end = to_byte if method == "bilinear" else np.rint
     down = sparse.csr_array(weights(height, size))
-    # Colours stay side by side: a row is `width * 3` numbers, a column of pixels three.
+    # Colours stay adjacent: a row has `width * 3` numbers, and a pixel three columns.
     across = sparse.csr_array(np.kron(weights(width, size), np.eye(3, dtype=down.dtype)))
 
     def resize(frame: np.ndarray) -> np.ndarray:
@@ -63,13 +62,13 @@ def make_resize(
 
 
 def check_smaller(field: str, size: int, *, largest: int = SCREEN_WIDTH) -> None:
-    """Refuses a size that "area" does not reach, because it only makes smaller.
+    """Refuses a size above `largest`, because "area" can only shrink.
 
     Raises:
-      InvalidInput: names the largest.
+      InvalidInput: names the largest size.
     """
     if size > largest:
-        remedy = f'resize="area" only makes smaller: use at most {largest}'
+        remedy = f'resize="area" can only shrink frames: use at most {largest}'
         raise InvalidInput(field, size, remedy)
 
 
@@ -78,8 +77,8 @@ def fixed_triangle(source: int, target: int) -> np.ndarray:
 
         w(i, j) ~ max(0, 1 - |j + 1/2 - c_i| / s),  c_i = (i + 1/2) source / target
 
-    with s = max(1, source / target), so that a smaller image misses no pixel. A weighted
-    sum of bytes stays below 2**31.
+    with s = max(1, source / target), so that shrinking skips no pixel. A weighted sum of
+    bytes stays below 2**31.
     """
     scale = source / target
     centre = (np.arange(target)[:, None] + 0.5) * scale
@@ -90,7 +89,7 @@ def fixed_triangle(source: int, target: int) -> np.ndarray:
 
 
 def overlap(source: int, target: int) -> np.ndarray:
-    """OpenCV's area weights `[target, source]`, float32: shares of a new pixel's length."""
+    """OpenCV's area weights `[target, source]`, float32: fractions of a new pixel's length."""
     scale = source / target
     begin = np.arange(target)[:, None] * scale
     pixel = np.arange(source)
@@ -99,12 +98,12 @@ def overlap(source: int, target: int) -> np.ndarray:
 
 
 def to_byte(total: np.ndarray) -> np.ndarray:
-    """Rounds sums in units of 2**-22 to whole numbers, halves up; in place."""
+    """Rounds sums in units of 2**-22 to integers, halves up; in place."""
     total += 1 << (PRECISION - 1)
     total >>= PRECISION
     return total
 
 
 def unchanged(total: np.ndarray) -> np.ndarray:
-    """Area averages are rounded at the end only."""
+    """Does nothing: area averages are rounded only at the end."""
     return total

@@ -1,10 +1,10 @@
-"""Any Gymnasium environment as a simulator, and what has to hold of it.
+"""Any Gymnasium environment as a simulator.
 
     pool = vawm.envs.from_gymnasium("CartPole-v1", num_envs=4)
     pool = vawm.envs.from_gymnasium(lambda: MyEnv(size=5), time_limit=1000)
 
-An environment is made in the processes of the pool only, and looked over before its first
-episode: everything that is wrong with it comes as one `InvalidInput`.
+Environments are made only in the processes of the pool. They are checked before the first
+episode; one `InvalidInput` lists everything that is wrong.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ from vawm.types import ArraySpec, PyTree, image, vector
 class GymnasiumSimulator:
     """A Gymnasium environment as a `Simulator`.
 
-    Actions: a `Box` becomes [-1, 1], stretched to its bounds; a `Discrete` its choices.
-    Observations: a `Box`, or a `Dict` of them whose keys stay. Of a `Box`, square pictures of
-    bytes stay, with a channel axis if they have none; everything else becomes a float32
-    vector. An episode is terminal where it is `terminated`, and over where it is `truncated`.
+    Actions: [-1, 1] is scaled to the bounds of a `Box`; a `Discrete` keeps its choices.
+    Observations: a `Box`, or a `Dict` of boxes, which keeps its keys. Square uint8 images
+    stay images and get a channel axis if they have none; any other `Box` becomes a float32
+    vector. `terminated` sets `is_terminal` and `is_last`; `truncated` sets `is_last`.
     """
 
     def __init__(self, env: gymnasium.Env):
         """Takes over `env`.
 
         Raises:
-          InvalidInput: its spaces are of another kind.
+          InvalidInput: its spaces are not supported.
         """
         refuse(str(env), space_problems(env))
         self._env = env
@@ -81,12 +81,12 @@ class GymnasiumSimulator:
         return to_array(obs, self._seen)
 
     def _action(self, action: np.ndarray | int) -> Any:
-        """The environment's own action for one in [-1, 1], or for an index."""
+        """The environment's action for an action in [-1, 1] or for an index."""
         dtype = self._actions.dtype.type
         if self.discrete:
             return dtype(self._actions.start + action)
         low, high = self._actions.low, self._actions.high
-        # Halves first: bounds may be as far apart as floats reach. Symmetric ones lose no bit.
+        # Halve first: high - low may overflow. Symmetric bounds lose no bit.
         center, reach = low / 2 + high / 2, high / 2 - low / 2
         native = center + reach * np.reshape(action, low.shape).astype(dtype)
         return np.clip(native, low, high)
@@ -104,24 +104,24 @@ def from_gymnasium(
     task: str | None = None,
     **kwargs: Any,
 ) -> Pool:
-    """N copies of a Gymnasium environment, in processes of their own.
+    """Runs N copies of a Gymnasium environment in separate processes.
 
     Args:
       make: a registered id, such as "CartPole-v1" or "module:Name-v0"; or a function or class
-        that makes the environment. Nothing is made in this process.
+        that makes the environment. It is not called in this process.
       num_envs: N.
-      time_limit: steps after which an episode is truncated; instead of the registered limit,
-        or on top of what a function makes.
+      time_limit: steps after which an episode is truncated. Replaces the registered limit
+        of an id; is added to what a function makes.
       workers: processes; see `Pool`, also for `timeout` and `on_failure`.
-      check: whether to look for `problems` with one environment more, made for that alone.
-      task: name of the task; that of `make` if not given.
+      check: whether to look for `problems` first, with one extra environment.
+      task: name of the task; default the name of `make`.
       **kwargs: for `gymnasium.make`, or for the function.
 
     Returns:
-      A `Pool`, which has to be closed.
+      A `Pool`; the caller must close it.
 
     Raises:
-      InvalidInput: an unknown id, an impossible number, or all problems at once.
+      InvalidInput: an unknown id, an impossible number, or a list of all problems.
       EnvironmentFailure: the environment could not be made.
     """
     if time_limit is not None:
@@ -141,10 +141,10 @@ def from_gymnasium(
 
 
 def check_id(name: str) -> RegisteredEnv:
-    """What is registered under an id; "module:id" imports the module first.
+    """The environment registered under an id; "module:id" imports the module first.
 
     Raises:
-      InvalidInput: nothing is; names the nearest id.
+      InvalidInput: the id is not registered; suggests the nearest one.
     """
     module, _, registered = name.rpartition(":")
     if module:
@@ -161,7 +161,7 @@ def check_id(name: str) -> RegisteredEnv:
 
 
 def name_of(make: str | Callable[..., Any]) -> str:
-    """A name for the task, fit for a folder unless it is an id."""
+    """A name for the task. Can name a folder, unless it is an id."""
     if isinstance(make, str):
         return make.rpartition(":")[2]
     name = getattr(make, "__name__", "")
@@ -174,10 +174,10 @@ def make_environment(
     time_limit: int | None,
     kwargs: Mapping[str, Any],
 ) -> gymnasium.Env:
-    """Makes the environment; ids that only the pool's process registered included.
+    """Makes the environment, even if its id is registered only in the pool's process.
 
     Raises:
-      InvalidInput: Gymnasium refuses to, for example for want of a package.
+      InvalidInput: Gymnasium cannot make it, for example because a package is missing.
     """
     if not isinstance(source, RegisteredEnv):
         env = source(**kwargs)
@@ -185,7 +185,7 @@ def make_environment(
             env = TimeLimit(env, time_limit)
         return env
     limit = {} if time_limit is None else {"max_episode_steps": time_limit}
-    settings = {"disable_env_checker": True, **kwargs, **limit}  # we look ourselves
+    settings = {"disable_env_checker": True, **kwargs, **limit}  # `problems` checks instead
     try:
         return gymnasium.make(source, **settings)
     except (gymnasium.error.Error, ImportError) as error:
@@ -198,10 +198,10 @@ def simulate(make_env: Callable[[], gymnasium.Env]) -> Simulator:
 
 
 def check_and_simulate(make_env: Callable[[], gymnasium.Env], task: str) -> Simulator:
-    """Makes a simulator after a look at an environment of its own.
+    """Checks a separate environment, then makes a simulator.
 
     Raises:
-      InvalidInput: all problems.
+      InvalidInput: lists all problems.
     """
     env = make_env()
     found = problems(env)
@@ -212,22 +212,22 @@ def check_and_simulate(make_env: Callable[[], gymnasium.Env], task: str) -> Simu
 
 
 def array_spec(box: Any) -> ArraySpec:
-    """What `to_array` returns."""
+    """Shape and dtype of what `to_array` returns."""
     if not pixels(box):
         return vector(math.prod(box.shape))
     return image(box.shape[0], channels=box.shape[2] if len(box.shape) == 3 else 1)
 
 
 def to_array(obs: Any, box: Any) -> np.ndarray:
-    """An observation of a `Box` as its spec says, if it is as its space says.
+    """Converts an observation of a `Box` to its `array_spec`.
 
     Raises:
-      ValueError: it has another shape.
+      ValueError: its shape is not that of the space.
     """
     if pixels(box):
-        array = np.asarray(obs)  # another dtype or shape is the pool's to refuse
+        array = np.asarray(obs)  # the pool refuses a wrong dtype or shape
         return array[..., None] if len(box.shape) == 2 else array
     array = np.asarray(obs, np.float32)
     if array.shape != box.shape:
-        raise ValueError(f"an observation has shape {array.shape}, its space {box.shape}")
+        raise ValueError(f"observation has shape {array.shape}, but its space {box.shape}")
     return array.reshape(-1)

@@ -1,7 +1,7 @@
-"""What has to hold of a Gymnasium environment: everything that does not, at once.
+"""Checks a Gymnasium environment and lists all problems at once.
 
-Each problem is one clause and its remedy. What is returned is looked at while seeded random
-actions are played, in an environment that is made for that.
+Each problem is one clause and its remedy. The check plays seeded random actions in a separate
+environment and looks at all returned values.
 """
 
 from __future__ import annotations
@@ -22,39 +22,39 @@ from vawm.errors import InvalidInput
 from vawm.types import IMAGE_SIZES
 
 SMALLEST_IMAGE = 16
-"""Pixels a side from which bytes are a picture and not a table of numbers."""
+"""Pixels per side from which a uint8 array counts as an image."""
 TOLERANCE = 1e-4
-"""By which observations may leave their bounds, relative to them or to 1: rounding."""
+"""How far observations may leave their bounds, relative to max(1, |bound|), for rounding."""
 
 Add = Callable[[str, str], Any]
-"""Takes a kind of problem and its text; the first of a kind counts."""
+"""Takes a kind of problem and its text; only the first of each kind is kept."""
 
 
 def problems(env: gymnasium.Env, *, steps: int = 1000, seconds: float = 5.0) -> list[str]:
-    """Everything that keeps an environment from being learned from, each with a remedy.
+    """Everything that makes an environment unusable for training, each with a remedy.
 
     Plays random actions, always the same ones. Never raises; does not close `env`.
 
     Args:
-      env: used up: its state afterwards is of no use.
-      steps: actions to play.
-      seconds: after which no further action is played.
+      env: the environment; do not use it afterwards.
+      steps: number of actions to play.
+      seconds: time after which it stops playing.
     """
     if not isinstance(env, gymnasium.Env):
         kind = f"{type(env).__module__}.{type(env).__qualname__}"
-        return [f"it is a {kind}: derive it from gymnasium.Env"]
+        return [f"the environment is a {kind}: derive it from gymnasium.Env"]
     return look_at(
         env,
         {
             "observation_space": look_at_observation_space,
             "action_space": look_at_action_space,
-            "a trial": functools.partial(try_out, steps=steps, seconds=seconds),
+            "random play": functools.partial(try_out, steps=steps, seconds=seconds),
         },
     )
 
 
 def space_problems(env: gymnasium.Env) -> list[str]:
-    """Those of `problems` that show without playing."""
+    """The `problems` of an environment's spaces, found without playing."""
     return look_at(
         env,
         {
@@ -65,18 +65,18 @@ def space_problems(env: gymnasium.Env) -> list[str]:
 
 
 def look_at(env: gymnasium.Env, looks: Mapping[str, Callable[..., None]]) -> list[str]:
-    """What some looks find; one that fails is a problem itself."""
+    """Runs some checks and returns their problems; a check that raises is a problem too."""
     found: dict[str, str] = {}
     for name, look in looks.items():
         try:
             look(env, found.setdefault)
         except (Exception, SystemExit) as error:
-            found[name] = f"{name} raised {one_line(error)}: make it work by itself"
+            found[name] = f"{name} raised {one_line(error)}: fix the environment"
     return list(found.values())
 
 
 def look_at_observation_space(env: gymnasium.Env, add: Add) -> None:
-    """A `Box` or a `Dict` of them, pictures square and of one size."""
+    """Checks for a `Box` or a `Dict` of them, with square images of one size."""
     space: Any = env.observation_space
     if not isinstance(space, spaces.Dict):
         if text := box_problem(space):
@@ -88,19 +88,19 @@ def look_at_observation_space(env: gymnasium.Env, add: Add) -> None:
     for key, entry in boxes.items():
         name = f"observation_space[{key!r}]"
         if not isinstance(key, str):
-            add(name, f"{name} has a key that is no string: use a string")
+            add(name, f"{name} has a key that is not a string: use a string")
         if text := box_problem(entry):
             add(name, f"{name} {text}")
     sides = {
         key: box.shape[0] for key, box in boxes.items() if not box_problem(box) and pixels(box)
     }
     if len(set(sides.values())) > 1:
-        remedy = "give all the same with gymnasium.wrappers.ResizeObservation"
-        add("image sizes", f"images have sides of {sides} pixels: {remedy}")
+        remedy = "resize them to one size with gymnasium.wrappers.ResizeObservation"
+        add("image sizes", f"images differ in size, {sides} pixels per side: {remedy}")
 
 
 def box_problem(space: Any) -> str:
-    """What is wrong with a space of observations, and a remedy; "" if nothing is."""
+    """The problem of an observation space with its remedy, or ""."""
     if not isinstance(space, spaces.Box):
         remedy = "return a Box from an ObservationWrapper"
         if isinstance(space, spaces.Space) and space.is_np_flattenable:
@@ -108,18 +108,18 @@ def box_problem(space: Any) -> str:
         return f"is {space!s:.100}, not a Box: {remedy}"
     shape = space.shape
     if 0 in shape:
-        return f"has shape {shape}, no numbers at all: leave it out"
+        return f"has shape {shape}, so it is empty: remove it"
     if len(shape) < 2:
         return ""
     if space.dtype != np.uint8:
         if sorted(shape)[-2] < IMAGE_SIZES[0]:
             return ""
-        remedy = "declare bytes if it is a picture, flatten it if it is none"
-        return f"has shape {shape} like a picture, of {space.dtype}: {remedy}"
+        remedy = "declare uint8 if it is an image, flatten it if it is not"
+        return f"has the shape of an image, {shape}, but dtype {space.dtype}: {remedy}"
     if len(shape) > 3:
-        return f"has bytes of shape {shape}: stack frames along the channels, (H, W, C)"
+        return f"has uint8 of shape {shape}: stack frames along the channels, (H, W, C)"
     if len(shape) == 3 and shape[0] < SMALLEST_IMAGE <= shape[1] == shape[2]:
-        remedy = "move them last with gymnasium.wrappers.TransformObservation"
+        remedy = "move channels last with gymnasium.wrappers.TransformObservation"
         return f"has images of shape {shape}, channels first: {remedy}"
     if not pixels(space):
         return ""
@@ -128,43 +128,43 @@ def box_problem(space: Any) -> str:
         return f"has images of shape {shape}, not square: {remedy}"
     if shape[0] not in IMAGE_SIZES:
         sizes = f"a multiple of {IMAGE_SIZES.step} from {IMAGE_SIZES[0]} to {IMAGE_SIZES[-1]}"
-        remedy += ", or FlattenObservation if it is no picture"
-        return f"has images of {shape[0]} pixels a side, not {sizes}: {remedy}"
+        remedy += ", or FlattenObservation if it is not an image"
+        return f"has images with {shape[0]} pixels per side, not {sizes}: {remedy}"
     return ""
 
 
 def pixels(box: Any) -> bool:
-    """Whether a `Box` is of pictures, if it has no problem."""
+    """Whether a `Box` without problems holds images."""
     if box.dtype != np.uint8 or len(box.shape) not in (2, 3):
         return False
     return min(box.shape[:2]) >= SMALLEST_IMAGE
 
 
 def look_at_action_space(env: gymnasium.Env, add: Add) -> None:
-    """A `Discrete`, or a `Box` of floats between bounds."""
+    """Checks for a `Discrete`, or a `Box` of floats with finite bounds."""
     space: Any = env.action_space
     if isinstance(space, spaces.Discrete):
         return
     if not isinstance(space, spaces.Box):
-        remedy = "make it one Discrete or one Box with gymnasium.wrappers.TransformAction"
+        remedy = "turn it into a Discrete or a Box with gymnasium.wrappers.TransformAction"
         add("action_space", f"action space is {space!s:.100}: {remedy}")
         return
     if 0 in space.shape:
-        add("action_space", f"action space has shape {space.shape}: there is nothing to choose")
+        add("action_space", f"action space has shape {space.shape}: give it an action")
     if space.dtype.kind != "f":
         remedy = "use a Discrete, or floats that the environment rounds"
         add("action_space", f"action space is a Box of {space.dtype}: {remedy}")
     elif not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
-        remedy = "declare the finite low and high that actions need"
-        add("action_space", f"action space {space!s:.100} has no bounds: {remedy}")
+        remedy = "declare finite low and high"
+        add("action_space", f"action space {space!s:.100} is not bounded: {remedy}")
     elif (space.low > space.high).any():
-        add("action_space", "action space has bounds that are reversed: swap low and high")
+        add("action_space", "action space has low above high: swap them")
 
 
 def try_out(env: gymnasium.Env, add: Add, *, steps: int, seconds: float) -> None:
-    """Plays seeded random actions and looks at all that is returned."""
+    """Plays seeded random actions and checks all returned values."""
     limited = has_time_limit(env)
-    with contextlib.suppress(Exception):  # sampling shows what is wrong
+    with contextlib.suppress(Exception):  # sampling will show the problem
         env.action_space.seed(0)
     end = time.monotonic() + seconds
     playing, episode, over, ended = env, 0, True, False
@@ -179,8 +179,8 @@ def try_out(env: gymnasium.Env, add: Add, *, steps: int, seconds: float) -> None
         try:
             action = env.action_space.sample()
         except (Exception, SystemExit) as error:
-            # Of the same kind as, and hidden by, what was seen of the space before.
-            text = f"action_space.sample() raised {one_line(error)}: mend the space"
+            # The same kind as, and hidden by, an earlier problem of the space.
+            text = f"action_space.sample() raised {one_line(error)}: fix the space"
             add("action_space", text)
             return
         try:
@@ -189,20 +189,21 @@ def try_out(env: gymnasium.Env, add: Add, *, steps: int, seconds: float) -> None
             if "values to unpack" in str(error) and playing is not playing.unwrapped:
                 playing, over = playing.unwrapped, True  # wrappers expect five values
                 continue
-            add("step", f"step() raised {one_line(error)}: play random actions to see where")
+            remedy = "fix step(); random actions reproduce it"
+            add("step", f"step() raised {one_line(error)}: {remedy}")
             return
         over = look_at_step(result, playing.observation_space, add)
         ended |= over
     if not ended and not limited:
-        remedy = "pass time_limit="
-        add("end", f"no episode ended within {steps} random steps, and none has to: {remedy}")
+        missing = f"no episode ended within {steps} random steps, and there is no time limit"
+        add("end", f"{missing}: pass time_limit=")
 
 
 def look_at_step(result: Any, space: Any, add: Add) -> bool:
-    """Looks at what `step` returned; whether the episode is over."""
+    """Checks what `step` returned; returns whether the episode is over."""
     five = "return obs, reward, terminated, truncated, info"
     if isinstance(result, tuple) and len(result) == 4:  # the API of gym before 0.26
-        add("step values", f"step() returns 4 values, one flag for two kinds of end: {five}")
+        add("step values", f"step() returns 4 values, as gym before 0.26: {five}")
         result = (*result[:3], False, result[3])
     if not isinstance(result, tuple) or len(result) != 5:
         add("step values", f"step() returns {number_of(result)}: {five}")
@@ -217,7 +218,7 @@ def look_at_step(result: Any, space: Any, add: Add) -> bool:
 
 
 def has_time_limit(env: gymnasium.Env) -> bool:
-    """Whether it is known that every episode ends."""
+    """Whether the environment has a time limit, so that every episode ends."""
     layer = env
     while isinstance(layer, gymnasium.Wrapper):
         if isinstance(layer, TimeLimit):
@@ -227,7 +228,12 @@ def has_time_limit(env: gymnasium.Env) -> bool:
 
 
 def begin(env: gymnasium.Env, seed: int, add: Add) -> gymnasium.Env | None:
-    """Resets and looks at what is returned; `env`, its innermost, or None if that fails."""
+    """Resets and checks what is returned.
+
+    Returns:
+      The environment to play: `env`, or the innermost one if wrappers cannot reset it; None
+      if `reset` fails.
+    """
     try:
         try:
             result: Any = env.reset(seed=seed)
@@ -239,7 +245,7 @@ def begin(env: gymnasium.Env, seed: int, add: Add) -> gymnasium.Env | None:
             env = env.unwrapped  # wrappers pass the seed on
             result = env.reset()
     except (Exception, SystemExit) as error:
-        add("reset", f"reset() raised {one_line(error)}: make it work by itself")
+        add("reset", f"reset() raised {one_line(error)}: fix reset()")
         return None
     if isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], dict):
         result = result[0]
@@ -251,29 +257,32 @@ def begin(env: gymnasium.Env, seed: int, add: Add) -> gymnasium.Env | None:
 
 
 def number_of(result: Any) -> str:
-    """How many values were returned."""
+    """Describes how many values were returned."""
     if isinstance(result, tuple):
         return f"{len(result)} values"
     return f"one value, a {type(result).__name__}"
 
 
 def look_at_observation(obs: Any, space: Any, add: Add) -> None:
-    """As the space says, finite and within bounds."""
+    """Checks that an observation matches its space, is finite and within bounds."""
     if not isinstance(space, spaces.Dict):
         look_at_array("obs", obs, space, add)
         return
     if not isinstance(obs, Mapping):
-        add("obs", f"obs is a {type(obs).__name__}, its space a Dict: return a dict")
+        add("obs", f"obs is a {type(obs).__name__}, but its space is a Dict: return a dict")
         return
     if set(obs) != set(space.spaces):
-        keys = f"obs has keys {sorted(map(str, obs))}, its space {sorted(space.spaces)}"
+        keys = f"obs has keys {sorted(map(str, obs))}, but its space {sorted(space.spaces)}"
         add("obs keys", f"{keys}: return the keys of the space")
     for key in space.spaces.keys() & obs.keys():
         look_at_array(f"obs[{key!r}]", obs[key], space[key], add)
 
 
 def look_at_array(name: str, obs: Any, box: Any, add: Add) -> None:
-    """As the `Box` says, finite and within bounds; other spaces are a problem themselves."""
+    """Checks that an array matches its `Box`, is finite and within bounds.
+
+    Skips other spaces, because `look_at_observation_space` reports them.
+    """
     if not isinstance(box, spaces.Box):
         return
     if not isinstance(obs, (np.ndarray, np.generic)):
@@ -282,10 +291,10 @@ def look_at_array(name: str, obs: Any, box: Any, add: Add) -> None:
         return
     if obs.dtype != box.dtype:
         remedy = f"return .astype(np.{box.dtype}), or declare a Box of {obs.dtype}"
-        add(f"{name} dtype", f"{name} is {obs.dtype}, its space {box.dtype}: {remedy}")
+        add(f"{name} dtype", f"{name} is {obs.dtype}, but its space {box.dtype}: {remedy}")
     if obs.shape != box.shape:
-        remedy = "return what the space says, or declare the other"
-        add(f"{name} shape", f"{name} has shape {obs.shape}, its space {box.shape}: {remedy}")
+        text = f"{name} has shape {obs.shape}, but its space {box.shape}"
+        add(f"{name} shape", f"{text}: change one of them")
         return
     if obs.dtype.kind not in "fiub":
         return
@@ -299,20 +308,18 @@ def look_at_array(name: str, obs: Any, box: Any, add: Add) -> None:
     high = high + TOLERANCE * np.maximum(1, np.abs(high))
     if (outside := (value < low) | (value > high)).any():
         where, worst = first(outside, value)
-        remedy = "declare wider bounds"
-        add(
-            f"{name} bounds", f"{name}{where} is {worst:g}, out of its space's bounds: {remedy}"
-        )
+        text = f"{name}{where} is {worst:g}, outside the bounds of its space"
+        add(f"{name} bounds", f"{text}: declare wider bounds")
 
 
 def first(mask: np.ndarray, value: np.ndarray) -> tuple[str, float]:
-    """Index, in brackets, and value of the first entry that is True in a mask."""
+    """The first entry that is True in a mask: its index in brackets, and its value."""
     where = np.argwhere(mask)[0].tolist()
     return f"{where or ''}", float(value[tuple(where)])
 
 
 def look_at_reward(reward: Any, add: Add) -> None:
-    """A finite number."""
+    """Checks that the reward is a finite number."""
     if np.ndim(reward):
         add("reward", f"reward has shape {np.shape(reward)}: return a number")
     elif not isinstance(np.asarray(reward)[()], (np.bool_, np.integer, np.floating)):
@@ -322,7 +329,7 @@ def look_at_reward(reward: Any, add: Add) -> None:
 
 
 def refuse(name: str, found: list[str]) -> None:
-    """Raises `InvalidInput` for an environment with problems."""
+    """Raises `InvalidInput` if an environment has problems."""
     if found:
         count = f"{len(found)} problem{'s' if len(found) > 1 else ''}"
         listed = "; ".join(f"({i}) {text}" for i, text in enumerate(found, start=1))

@@ -1,13 +1,13 @@
-"""N environments on the host, stepped side by side in processes of their own.
+"""N environments on the host, stepped in parallel in separate processes.
 
     with Pool(MySimulator, task="mine", num_envs=4) as pool:
         timestep = pool.reset(seed=0)
         pool.send(action)  # returns at once
         timestep = pool.receive()
 
-The stream is that of `vawm.envs.protocol`. It does not depend on the number of workers: the
-seed of an episode follows from the seed of the pool, the environment and how many episodes
-it had before. A pool is used by one thread at a time.
+The stream convention is that of `vawm.envs.protocol`. The stream does not depend on the
+number of workers: the seed of an episode follows from the pool's seed, the environment's
+index and its number of earlier episodes. Only one thread may use a pool at a time.
 """
 
 from __future__ import annotations
@@ -28,27 +28,27 @@ from vawm.types import EnvSpec, TimeStep
 __all__ = ["EnvironmentFailure", "Episodes", "Pool", "episode_seed"]
 
 MAX_KEPT = 30_000
-"""Actions of an episode up to which they are kept: 2 MB an environment for 18 of Atari."""
+"""Longest episode whose actions are kept: 2 MB per environment for Atari's 18 actions."""
 MAX_FAILURES = 3
-"""Failures of an environment in a row, without a step in between, that end the pool."""
+"""The pool ends after this many failures of an environment without a step in between."""
 START_TIMEOUT = 120.0
-"""Seconds for a simulator to be made: it may load libraries and compile."""
+"""Seconds to make a simulator: it may load libraries and compile."""
 
 
 class Episodes(NamedTuple):
-    """The running episode of every environment, enough to play it again."""
+    """The running episode of every environment, enough to replay it."""
 
-    index: np.ndarray  # type: ignore[assignment]  # [N] int64, episodes begun before this one
-    length: np.ndarray  # [N] int64, actions so far; -1 where it got too long to be kept
-    actions: np.ndarray  # [sum of lengths, A] float32, raw as sent, one environment's first
+    index: np.ndarray  # type: ignore[assignment]  # [N] int64, number of earlier episodes
+    length: np.ndarray  # [N] int64, actions so far; -1 if the episode is too long to keep
+    actions: np.ndarray  # [sum of lengths, A] float32, raw as sent, environment by environment
 
 
 class Pool:
-    """N environments side by side.
+    """N environments, stepped in parallel.
 
     Attributes:
-      spec: what an agent has to know; mostly what the simulators say.
-      restarts: environments that had to be begun anew after a failure, so far.
+      spec: what an agent has to know; mostly from the simulators.
+      restarts: number of restarts after a failure so far.
     """
 
     def __init__(
@@ -67,20 +67,20 @@ class Pool:
 
         Args:
           make: makes a simulator; called once for each environment, in its worker. May be a
-            lambda or a closure: each environment has a copy of what it holds.
+            lambda or a closure: each environment gets its own copy.
           task: name of the task.
           num_envs: N.
-          action_repeat: control steps per step of the simulator, for the agent to know.
-          workers: processes; 0 for as many as there are cores, never more than N.
-          timeout: seconds that one call of a simulator may take; for making one at least
-            `START_TIMEOUT`.
-          on_failure: what follows when an environment raises, dies, hangs or returns what is
-            not sound. "raise" ends the pool, "restart" begins a new episode.
-          first: makes that of environment 0 in place of `make`, but not after a failure: the
-            place to try a simulator out.
+          action_repeat: control steps per step of the simulator; only recorded in `spec`.
+          workers: processes; 0 for one per core. Never more than N.
+          timeout: seconds that one call of a simulator may take. Making a simulator may take
+            at least `START_TIMEOUT`.
+          on_failure: what to do if an environment raises, dies, hangs or returns an invalid
+            value. "raise" ends the pool, "restart" starts a new episode.
+          first: replaces `make` for environment 0, but not after a failure. Use it to check
+            a simulator.
 
         Raises:
-          InvalidInput: an impossible choice, or what the maker of a simulator refuses.
+          InvalidInput: an impossible choice, or an `InvalidInput` that `make` raised.
           EnvironmentFailure: a simulator could not be made.
         """
         check_choices(num_envs, action_repeat, workers, timeout, on_failure)
@@ -89,11 +89,11 @@ class Pool:
         self._start_timeout = max(START_TIMEOUT, timeout)
         self._make = pickled(make)
         self._state: Literal["new", "ready", "sent"] = "new"
-        self._failure: EnvironmentFailure | None = None  # that ended the pool
+        self._failure: EnvironmentFailure | None = None  # the one that ended the pool
         self._index = np.zeros(num_envs, np.int64)
         self._length = np.zeros(num_envs, np.int64)
         self._failures = np.zeros(num_envs, np.int64)  # in a row
-        self._over = np.zeros(num_envs, bool)  # the next step begins an episode
+        self._over = np.zeros(num_envs, bool)  # whether the next step starts an episode
         self._crew = Crew(num_envs, workers, timeout)
         try:
             self.spec = self._start(
@@ -108,7 +108,7 @@ class Pool:
         self._kept = np.zeros((num_envs, 1024, self.spec.action_size), np.float32)
 
     def reset(self, seed: int) -> TimeStep:
-        """All environments start their first episode.
+        """Starts the first episode of all environments.
 
         Raises:
           InvalidInput: a seed that is not a whole number of at least 0.
@@ -123,7 +123,7 @@ class Pool:
         return self._leave(is_first=np.ones(self.spec.num_envs, bool))
 
     def send(self, action: np.ndarray) -> None:
-        """Begins a step with `[N, action_size]` raw actions; simulation goes on meanwhile.
+        """Starts a step with `[N, action_size]` raw actions and returns at once.
 
         Raises:
           InvalidInput: actions of another shape.
@@ -143,11 +143,11 @@ class Pool:
         self._state = "sent"
 
     def receive(self) -> TimeStep:
-        """Waits for the step that `send` began; the arrays are copies.
+        """Waits for the step that `send` started; the arrays are copies.
 
         Raises:
-          EnvironmentFailure: an environment failed and may not be restarted; all workers
-            have been ended then.
+          EnvironmentFailure: an environment failed and may not be restarted. All workers
+            have been ended.
         """
         self._enter("sent")
         begun = self._over
@@ -160,7 +160,7 @@ class Pool:
         return self._leave(is_first=begun | self._recover(troubles))
 
     def episodes(self) -> Episodes:
-        """The running episodes, up to the time step that was received last."""
+        """The running episodes, up to the last received time step."""
         length = np.where(self._length <= MAX_KEPT, self._length, -1)
         parts = [kept[: max(0, n)] for kept, n in zip(self._kept, length, strict=True)]
         return Episodes(self._index.copy(), length, np.concatenate(parts))
@@ -168,21 +168,21 @@ class Pool:
     def restore(
         self, seed: int, episodes: Episodes, expected: TimeStep
     ) -> tuple[TimeStep, np.ndarray]:
-        """Plays the running episodes again, in place of `reset`.
+        """Replays the running episodes of an earlier pool; call it instead of `reset`.
 
         Args:
-          seed: that the pool was reset with.
-          episodes: of that pool, when the last it had returned was `expected`.
-          expected: all of it, `[N, ...]`.
+          seed: the seed that the earlier pool was reset with.
+          episodes: its `episodes()`.
+          expected: the last time step that it returned before, `[N, ...]`.
 
         Returns:
-          A time step, and `[N]` bool: which environments are where they were, observation,
-          reward and flags bit for bit as expected. The others, among them those whose
-          episode was too long to be kept, begin a new episode.
+          A time step, and `[N]` bool: the environments whose observation, reward and flags
+          equal `expected` bit for bit. The others start a new episode, among them those
+          whose episode was too long to keep.
 
         Raises:
-          InvalidInput: episodes or a time step of other environments.
-          EnvironmentFailure: an environment that begins a new episode failed.
+          InvalidInput: `episodes` or `expected` do not fit these environments.
+          EnvironmentFailure: an environment that starts a new episode failed.
         """
         self._seed = check_seed(seed)
         index, length, actions = check_episodes(episodes, self.spec)
@@ -221,27 +221,27 @@ class Pool:
         self.close()
 
     def _enter(self, *states: str) -> None:
-        """Begins a call that has its place among the others.
+        """Checks that a call is allowed now, given the calls before it.
 
-        Until the call has done its part the state is "new": when one was interrupted, only
-        `reset` and `restore` make sense.
+        The state is "new" until the call is complete: after an interrupted call, only
+        `reset` and `restore` are allowed.
         """
         if self._crew.closed:
             raise RuntimeError("the pool is closed") from self._failure
         if self._state not in states:
             first = {"new": "reset() or restore()", "ready": "send()", "sent": "receive()"}
-            raise RuntimeError(f"{first[self._state]} has to come first")
+            raise RuntimeError(f"call {first[self._state]} first")
         self._state = "new"
 
     def _leave(self, is_first: np.ndarray) -> TimeStep:
-        """Ends such a call, with what arrived."""
+        """Completes a call; returns the time step that arrived."""
         timestep = self._timestep(is_first)
         self._over = np.array(timestep.is_last)
         self._state = "ready"
         return timestep
 
     def _timestep(self, is_first: np.ndarray) -> TimeStep:
-        """Copies of what the workers wrote, because JAX may read them long afterwards."""
+        """Copies what the workers wrote, because JAX may read the arrays much later."""
 
         def copy(name: str) -> Any:
             return self._arrays[name].copy()
@@ -256,7 +256,7 @@ class Pool:
         )
 
     def _start(self, first: bytes, task: str, action_repeat: int) -> EnvSpec:
-        """Starts all workers, makes all simulators and asks them what they are."""
+        """Starts all workers, makes all simulators and returns their common spec."""
         factories = dict.fromkeys(self._crew.start_missing(), self._make) | {0: first}
         described, troubles = self._crew.build(factories, timeout=self._start_timeout)
         for env in sorted(troubles):
@@ -265,7 +265,8 @@ class Pool:
             self._fail(env, troubles[env])
         for env, description in described.items():
             if description != described[0]:
-                remedy = f"has to make equal simulators: {description} is not {described[0]}"
+                differs = f"made {description}, but {described[0]} for environment 0"
+                remedy = f"{differs}; make equal simulators"
                 raise InvalidInput("make", f"environment {env}", remedy)
         return EnvSpec(
             task=task,
@@ -275,18 +276,19 @@ class Pool:
         )
 
     def _build(self, broken: Collection[int] = ()) -> None:
-        """Makes broken simulators and those of lost workers anew."""
+        """Remakes broken simulators and those of lost workers."""
         envs = {*broken, *self._crew.start_missing()}
         factories = dict.fromkeys(sorted(envs), self._make)
         described, troubles = self._crew.build(factories, timeout=self._start_timeout)
         for env, said in described.items():
             if any(getattr(self.spec, name) != value for name, value in said._asdict().items()):
-                troubles[env] = Trouble(f"is not what it was: {said}", building=True)
+                reason = f"the simulator changed when it was made again: {said}"
+                troubles[env] = Trouble(reason, building=True)
         if troubles:
             self._judge(troubles)
 
     def _begin(self, envs: Collection[int]) -> dict[int, Trouble]:
-        """Begins the next episode of some environments."""
+        """Starts the next episode of some environments."""
         envs = list(envs)
         self._index[envs] += 1
         self._length[envs] = 0
@@ -294,7 +296,7 @@ class Pool:
         return self._crew.hear()[1]
 
     def _recover(self, troubles: Mapping[int, Trouble]) -> np.ndarray:
-        """Begins a new episode where something went wrong; `[N]` bool, where that was."""
+        """Starts a new episode in environments with trouble; `[N]` bool says which."""
         anew = self._mask(())
         while troubles:
             self._judge(troubles)
@@ -306,14 +308,14 @@ class Pool:
         return anew
 
     def _judge(self, troubles: Mapping[int, Trouble]) -> None:
-        """Ends the pool if what went wrong cannot be mended, or is not to be."""
+        """Ends the pool if an environment cannot or must not be restarted."""
         for env in sorted(troubles, key=lambda env: (not troubles[env].guilty, env)):
             trouble = troubles[env]
             if self._on_failure == "raise" or trouble.building:
                 self._fail(env, trouble)
             self._failures[env] += trouble.guilty
             if self._failures[env] >= MAX_FAILURES:
-                reason = f"{trouble.reason}, failure {MAX_FAILURES} in a row"
+                reason = f"{trouble.reason} ({MAX_FAILURES} failures in a row)"
                 self._fail(env, trouble._replace(reason=reason))
 
     def _fail(self, env: int, trouble: Trouble) -> NoReturn:
@@ -329,19 +331,19 @@ class Pool:
         raise self._failure
 
     def _keep(self, action: np.ndarray) -> None:
-        """Keeps the actions that count: an episode that begins ignores its."""
+        """Stores the actions, except those that a reset ignores."""
         envs = np.flatnonzero(~self._over & (self._length < MAX_KEPT))
         if envs.size:
             self._room(int(self._length[envs].max()) + 1)
             self._kept[envs, self._length[envs]] = action[envs]
 
     def _room(self, length: int) -> None:
-        """Makes room for so many actions of an episode."""
+        """Makes room for `length` actions of an episode."""
         while self._kept.shape[1] < length:
             self._kept = np.concatenate([self._kept, np.zeros_like(self._kept)], axis=1)
 
     def _mask(self, envs: Collection[int]) -> np.ndarray:
-        """`[N]` bool, True at `envs`."""
+        """`[N]` bool, True for `envs`."""
         chosen = np.zeros(len(self._index), bool)
         chosen[list(envs)] = True
         return chosen
@@ -356,14 +358,14 @@ def episode_seed(seed: int, env: int, episode: int) -> int:
     Args:
       seed: of the pool.
       env: index of the environment.
-      episode: how many it began before.
+      episode: number of episodes that it started before.
     """
     words = np.random.SeedSequence(seed, spawn_key=(env, episode)).generate_state(1)
     return int(words[0]) >> 1
 
 
 def rows_equal(a: TimeStep, b: TimeStep) -> np.ndarray:
-    """`[N]` bool: where all of two time steps is equal, bit for bit."""
+    """`[N]` bool: the environments for which two time steps are equal, bit for bit."""
     equal = np.ones(len(a.reward), bool)
     for (_, x), (_, y) in zip(arrays_of(a), arrays_of(b), strict=True):
         equal &= [p.tobytes() == q.tobytes() for p, q in zip(x, y, strict=True)]
@@ -371,7 +373,7 @@ def rows_equal(a: TimeStep, b: TimeStep) -> np.ndarray:
 
 
 def arrays_of(timestep: TimeStep) -> list[tuple[str, np.ndarray]]:
-    """(name, array in numpy) of everything in a time step."""
+    """(name, numpy array) of everything in a time step."""
     named = [(name, array) for name, _, array in leaves(timestep.obs)]
     named += zip(TimeStep._fields[1:], timestep[1:], strict=True)
     return [(name, np.asarray(array)) for name, array in named]
@@ -380,10 +382,10 @@ def arrays_of(timestep: TimeStep) -> list[tuple[str, np.ndarray]]:
 def check_choices(
     num_envs: int, action_repeat: int, workers: int, timeout: float, on_failure: str
 ) -> None:
-    """Refuses what a pool cannot be made with.
+    """Refuses impossible arguments of a pool.
 
     Raises:
-      InvalidInput: names the choice and the remedy.
+      InvalidInput: names the argument and the remedy.
     """
     check_positive("num_envs", num_envs)
     check_positive("action_repeat", action_repeat)
@@ -397,17 +399,17 @@ def check_choices(
 
 
 def check_seed(seed: Any) -> int:
-    """Refuses a seed that numpy cannot take."""
+    """Refuses a seed that numpy cannot use."""
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
         raise InvalidInput("seed", seed, "use a whole number of at least 0")
     return int(seed)
 
 
 def check_episodes(episodes: Episodes, spec: EnvSpec) -> Episodes:
-    """Copies as a pool keeps them.
+    """Copies episodes, with the pool's dtypes.
 
     Raises:
-      InvalidInput: they are not of `spec`'s environments.
+      InvalidInput: they do not fit the environments of `spec`.
     """
     index = np.array(episodes.index, np.int64)
     length = np.array(episodes.length, np.int64)
@@ -419,20 +421,20 @@ def check_episodes(episodes: Episodes, spec: EnvSpec) -> Episodes:
         ("actions", actions, (whole, spec.action_size)),
     ):
         if array.shape != shape:
-            remedy = f"give the episodes of these environments, of shape {shape}"
+            remedy = f"pass episodes of these environments, with shape {shape}"
             raise InvalidInput(f"episodes.{name}", array.shape, remedy)
     return Episodes(index, length, actions)
 
 
 def check_expected(expected: TimeStep, like: TimeStep) -> None:
-    """Refuses a time step of environments that do not return what is `like`.
+    """Refuses a time step with other names, dtypes or shapes than `like`.
 
     Raises:
-      InvalidInput: says what it is and what it has to be.
+      InvalidInput: names those given and those needed.
     """
     given, wanted = (
         {name: f"{array.dtype}{list(array.shape)}" for name, array in arrays_of(timestep)}
         for timestep in (expected, like)
     )
     if given != wanted:
-        raise InvalidInput("expected", given, f"give a time step of these: {wanted}")
+        raise InvalidInput("expected", given, f"pass a time step with {wanted}")

@@ -1,10 +1,10 @@
-"""Rendering without a display: which OpenGL backend works here, and how a process takes one.
+"""Rendering without a display: finds an OpenGL backend that works and selects it.
 
-EGL draws on a GPU, or on the CPU by Mesa; OSMesa always on the CPU. dm_control and PyOpenGL
-read their backend from the environment when they are imported, and an import that fails
-leaves PyOpenGL unusable. So a backend is tried in a process of its own, and a process that
-renders takes one before it imports dm_control. What MUJOCO_GL said before does not count;
-which GPU EGL uses is for MUJOCO_EGL_DEVICE_ID to say.
+EGL draws on a GPU, or on the CPU with Mesa; OSMesa always draws on the CPU. dm_control and
+PyOpenGL read their backend from environment variables at import, and a failed import leaves
+PyOpenGL unusable. So a backend is tried in a separate process, and a process that renders
+selects one before it imports dm_control. An existing MUJOCO_GL is ignored;
+MUJOCO_EGL_DEVICE_ID selects the GPU for EGL.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ PACKAGES = {
     "egl": "libegl1 libgl1-mesa-dri libopengl0",
     "osmesa": "libosmesa6",
 }
-"""What a backend needs of the system, as Debian and Ubuntu call it. For a GPU of NVIDIA its
-driver takes the place of libgl1-mesa-dri."""
+"""Packages that a backend needs on Debian and Ubuntu. With an NVIDIA GPU, its driver replaces
+libgl1-mesa-dri."""
 
 PROBE = """
 from dm_control import mujoco
@@ -37,16 +37,16 @@ model = "<mujoco><worldbody><geom size='1'/></worldbody></mujoco>"
 assert mujoco.Physics.from_xml_string(model).render(8, 8).any(), "the frame is black"
 """
 PROBE_SECONDS = 45
-LONGEST = 160  # characters of the reason why a backend does not work
+LONGEST = 160  # characters of an error that is quoted
 
 
 def choose(renderer: str) -> Backend:
-    """The backend to render with: `renderer`, or the first that works where it is "auto".
+    """The backend to render with: `renderer`, or the first that works if it is "auto".
 
-    Trying one takes about a second, once per process.
+    Trying a backend takes about a second, once per process.
 
     Raises:
-      InvalidInput: it does not work here; why, and which packages it needs.
+      InvalidInput: it does not work here; says why, and which packages it needs.
     """
     candidates = [backend for backend in BACKENDS if renderer in ("auto", backend)]
     if not candidates:
@@ -54,17 +54,18 @@ def choose(renderer: str) -> Backend:
     for backend in candidates:
         if not fault(backend):
             if backend != candidates[0]:
-                lacks = f"{candidates[0]} does not render here ({fault(candidates[0])})"
-                warnings.warn(f"{lacks}: {backend} does, its pixels differ", stacklevel=2)
+                broken = f"{candidates[0]} cannot render here ({fault(candidates[0])})"
+                warning = f"{broken}; using {backend}, whose pixels differ slightly"
+                warnings.warn(warning, stacklevel=2)
             return backend
-    why = ", ".join(f"{b} does not render here ({fault(b)})" for b in candidates)
+    why = ", ".join(f"{b} cannot render here ({fault(b)})" for b in candidates)
     how = ", or ".join(f"apt-get install {PACKAGES[b]}" for b in candidates)
     raise InvalidInput("env.renderer", renderer, f"{why}; {how}")
 
 
 @functools.cache
 def fault(backend: Backend) -> str:
-    """Why a process of its own cannot render with `backend`, in one line; "" if it can."""
+    """Tries `backend` in a new process; returns its error in one line, or "" if it works."""
     try:
         done = subprocess.run(
             [sys.executable, "-P", "-c", PROBE],
@@ -85,23 +86,23 @@ def fault(backend: Backend) -> str:
 
 
 def use(backend: Backend) -> None:
-    """Has this process render with `backend`; to be called before it imports dm_control.
+    """Makes this process render with `backend`; call it before importing dm_control.
 
     Raises:
-      InvalidInput: the process has another backend already.
+      InvalidInput: the process has already loaded another backend.
     """
     present = loaded()
     if present not in (None, backend):
-        remedy = f"this process has loaded {present!r} already; render in one of its own"
+        remedy = f"this process has already loaded {present!r}; render in a new process"
         raise InvalidInput("env.renderer", backend, remedy)
     os.environ.update(variables(backend))
 
 
 def variables(backend: Backend) -> dict[str, str]:
-    """What dm_control and PyOpenGL read at import.
+    """Environment variables that dm_control and PyOpenGL read at import.
 
-    OSMesa would have a thread per context, which is for programs that render from several;
-    EGL has none.
+    By default OSMesa uses one thread per context, which only programs that render from
+    several threads need; EGL uses none.
     """
     return {
         "MUJOCO_GL": backend,
@@ -111,7 +112,7 @@ def variables(backend: Backend) -> dict[str, str]:
 
 
 def loaded() -> str | None:
-    """The backend that dm_control or PyOpenGL has in this process; "off" is none for good."""
+    """The backend that this process has loaded; "off" if dm_control found none to load."""
     if (render := sys.modules.get("dm_control._render")) is not None:
         return str(render.BACKEND)
     if (opengl := sys.modules.get("OpenGL.platform")) is not None:

@@ -1,4 +1,4 @@
-"""What one environment on the host is: seeded episodes, one action at a time."""
+"""The interface of one environment on the host: seeded episodes, one action at a time."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from vawm.types import PyTree
 
 
 class Outcome(NamedTuple):
-    """What arrives after one action.
+    """The result of one action.
 
     Attributes:
-      obs: as `Simulator.obs` says; its arrays may be reused by the next step.
+      obs: as `Simulator.obs` specifies; the next step may reuse its arrays.
       reward: sum over the action repeat.
       is_last: the episode is over, for any reason; only `reset` may follow.
-      is_terminal: the return truly ends here. Mostly a last step, but a life that is lost
-        may end the return and not the episode.
+      is_terminal: the return ends here. Usually the last step of an episode, but a lost
+        life may end the return without ending the episode.
     """
 
     obs: PyTree
@@ -29,14 +29,14 @@ class Outcome(NamedTuple):
 class Simulator(Protocol):
     """One environment, made and used in one process.
 
-    An episode is a function of its seed and its actions: equal ones give equal outcomes, bit
-    for bit, whatever was played before. Resuming a run relies on it.
+    An episode must depend only on its seed and its actions: equal ones give equal outcomes,
+    bit for bit, whatever was played before. Resuming a run relies on this.
 
     Attributes:
       obs: an `ArraySpec` or a dict of them, as in `EnvSpec.obs`.
       action_size: width of the action, or number of discrete actions.
       discrete: whether actions are choices.
-      episode_length: steps of a full episode, None where it varies.
+      episode_length: steps of a full episode, None if it varies.
     """
 
     obs: PyTree
@@ -45,10 +45,10 @@ class Simulator(Protocol):
     episode_length: int | None
 
     def reset(self, seed: int) -> PyTree:
-        """Begins the episode `seed`, a number below 2**31; returns its first observation."""
+        """Starts the episode of `seed`, below 2**31; returns its first observation."""
 
     def step(self, action: np.ndarray | int) -> Outcome:
-        """One step: `[action_size]` float32 in [-1, 1], or the index of a discrete action."""
+        """Takes `[action_size]` float32 in [-1, 1], or the index of a discrete action."""
 
     def close(self) -> None:
-        """Gives back what it holds; nothing follows."""
+        """Frees all resources; no call follows."""

@@ -1,7 +1,7 @@
 """Tasks of the DeepMind Control Suite from pixels, simulated and rendered by dm_control.
 
-A control step of physics takes less than 0.2 ms; a frame takes 10 to 40 ms where a CPU draws
-it. So a frame is drawn only where it is seen: one per step, whatever the action repeat.
+A control step of physics takes less than 0.2 ms; drawing a frame on a CPU takes 10 to 40 ms.
+So only one frame per step is drawn, whatever the action repeat.
 """
 
 from __future__ import annotations
@@ -20,32 +20,31 @@ from vawm.types import PyTree, image
 
 VISION_TASKS = tuple(sorted((*TASKS, "quadruped_run", "quadruped_walk")))
 USUAL = -1
-"""The camera that a task has by default."""
+"""Selects the default camera of the task."""
 CAMERAS = {"quadruped": 2}
-"""Domain -> its usual camera, 0 for all others; as in DreamerV3."""
+"""Domain -> its default camera, 0 for all others; as in DreamerV3."""
 
 
 class VisionSimulator:
     """One task as a `Simulator`; observations are `[image_size, image_size, 3]` uint8.
 
-    An episode is that of `suite.load(domain, task, {"random": seed})` in its first reset.
-    All that dm_control keeps from one episode to the next is drawn anew at a reset (targets)
-    or the same in all episodes (sizes, damping), so the environment is never rebuilt.
+    An episode equals the first one of `suite.load(domain, task, {"random": seed})`.
+    Everything that dm_control keeps between episodes is either drawn again at a reset
+    (targets) or constant (sizes, damping), so the environment is never rebuilt.
 
-    Bit for bit, equal episodes have equal frames only where the same backend, driver and
-    hardware draw them.
+    Equal episodes have bit-identical frames only with the same backend, driver and hardware.
 
-    With `fast_rendering`, frames have no shadows, no reflections in floors and jagged edges,
-    and what is lit by a light that casts shadows is darker: the frame by up to 8 %, in
-    pendulum by a fifth, in reacher by a third. Where a CPU draws, it is 8 to 20 times as fast.
-    A simulator holds some 65 MB where Mesa draws, 45 MB with fast rendering.
+    With `fast_rendering`, frames have no shadows, no floor reflections and jagged edges.
+    Areas lit by a light that casts shadows are darker: the frame by up to 8 %, in pendulum
+    by a fifth, in reacher by a third. On a CPU it is 8 to 20 times as fast. A simulator
+    needs about 65 MB if Mesa draws, 45 MB with fast rendering.
 
     Args:
       task: one of `VISION_TASKS`.
-      image_size: pixels a side.
-      camera: its number in dm_control's model; -1 for the usual one.
-      renderer: "egl", "osmesa", or "auto" for the one that `rendering.choose` finds to work.
-        The first simulator of a process decides for all.
+      image_size: pixels per side.
+      camera: index in dm_control's model; -1 for the default camera.
+      renderer: "egl", "osmesa", or "auto" for the first that works, see
+        `rendering.choose`. The first simulator of a process decides for all.
       fast_rendering: False for exactly the pixels that dm_control renders by default.
       action_repeat: control steps per step; their rewards are summed.
 
@@ -71,7 +70,7 @@ class VisionSimulator:
         check_vision_task(task)
         check_positive("env.image_size", image_size)
         check_positive("action_repeat", action_repeat)
-        known = renderer in rendering.BACKENDS  # whoever names one has tried it
+        known = renderer in rendering.BACKENDS  # then the caller has already tried it
         rendering.use(cast(Any, renderer) if known else rendering.choose(renderer))
         from dm_control import mujoco, suite
 
@@ -79,8 +78,8 @@ class VisionSimulator:
         self._env = suite.load(domain, task.removeprefix(f"{domain}_"))
         physics, spec = self._env.physics, self._env.action_spec()
         visual = physics.model.vis
-        # Read when the first camera makes the context. Larger buffers than a frame's only
-        # cost memory, 20 MB each time.
+        # Read when the first camera makes the context. Buffers larger than a frame only
+        # waste memory, 20 MB each time.
         visual.global_.offwidth = visual.global_.offheight = image_size
         if fast_rendering:
             visual.quality.offsamples = visual.quality.shadowsize = 0
@@ -94,13 +93,13 @@ class VisionSimulator:
         self.episode_length = math.ceil(EPISODE_STEPS / action_repeat)
 
     def reset(self, seed: int) -> np.ndarray:
-        """Begins the episode that dm_control draws from this seed."""
+        """Starts the episode that dm_control draws from `seed`."""
         self._env.task.random.seed(seed)
         self._env.reset()
         return self._frame()
 
     def step(self, action: np.ndarray | int) -> Outcome:
-        """`action_repeat` control steps, fewer where the episode ends among them.
+        """Takes `action_repeat` control steps, fewer if the episode ends before.
 
         Raises:
           dm_control.rl.control.PhysicsError: the simulation diverged.
@@ -124,15 +123,15 @@ class VisionSimulator:
         self._env.physics.free()
 
     def _frame(self) -> np.ndarray:
-        # Upright: dm_control returns a flipped view of the buffer of its camera.
+        # Copy: dm_control returns a flipped view of its camera's buffer.
         return self._camera.render(render_flag_overrides=self._flags).copy()
 
 
 def check_vision_task(task: str) -> None:
-    """Refuses a name outside `VISION_TASKS`, with the nearest one.
+    """Refuses a name outside `VISION_TASKS` and suggests the nearest one.
 
     Raises:
-      InvalidInput: names the nearest task and all others.
+      InvalidInput: names the nearest task and all tasks.
     """
     if task in VISION_TASKS:
         return
@@ -141,7 +140,7 @@ def check_vision_task(task: str) -> None:
 
 
 def check_camera(camera: int, domain: str, *, cameras: int) -> int:
-    """The number of a camera of a model that has so many.
+    """The index of a camera in a model with `cameras` of them; resolves the default.
 
     Raises:
       InvalidInput: there is no such camera.
@@ -149,7 +148,7 @@ def check_camera(camera: int, domain: str, *, cameras: int) -> int:
     if camera == USUAL:
         return CAMERAS.get(domain, 0)
     if not 0 <= camera < cameras:
-        remedy = f"{domain} has cameras 0 to {cameras - 1}; use one, or -1 for the usual one"
+        remedy = f"use one of {domain}'s cameras, 0 to {cameras - 1}, or -1 for the default"
         raise InvalidInput("env.camera", camera, remedy)
     return camera
 

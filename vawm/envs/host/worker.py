@@ -1,11 +1,11 @@
 """The process that runs some environments of a pool.
 
-A worker answers orders, one at a time: `(ticket, name, {environment: payload})` is carried
-out for one environment after the other by the method `name` of `Worker`. Actions,
-observations, rewards and flags are in memory of both. It knows nothing of streams or
-policies: the pool says when an episode begins and what follows a failure.
+A worker answers one order at a time. For an order `(ticket, name, {environment: payload})` it
+calls the method `name` of `Worker` for each environment in turn. Actions, observations,
+rewards and flags are in shared memory. The pool decides when an episode starts and what
+follows a failure.
 
-It ends when the pool ends it, and with the pool's process, however that one ends.
+A worker ends when the pool ends it or when the pool's process ends, in whatever way.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ from vawm.errors import InvalidInput
 from vawm.process import streams
 from vawm.types import ArraySpec, PyTree
 
-IDLE = -1  # in place of an environment, between two orders
+IDLE = -1  # stands for no environment, between two orders
 WATCH_SECONDS = 1.0
-"""Between two looks at whether the pool's process lives, where the kernel does not tell."""
-TELL = signal.SIGUSR1  # asks a worker that hangs where it is
+"""Interval at which to check that the pool's process lives, if the kernel does not tell."""
+TELL = signal.SIGUSR1  # asks a hanging worker for its traceback
 PR_SET_PDEATHSIG = 1  # linux/prctl.h
 LARGEST = float(np.finfo(np.float32).max)
 LONGEST = 300  # characters of an exception's message
 
 
 class Description(NamedTuple):
-    """What a simulator says of itself; see `Simulator`."""
+    """The attributes of a simulator; see `Simulator`."""
 
     obs: PyTree
     action_size: int
@@ -58,9 +58,9 @@ class Trouble(NamedTuple):
     Attributes:
       reason: in a few words, without the environment.
       traceback: of the worker, or "".
-      building: whether it failed to be made.
-      guilty: False where another environment took the worker down.
-      refused: field, value and remedy where it raised `InvalidInput` when it was made.
+      building: whether the simulator could not be made.
+      guilty: False if another environment took the worker down.
+      refused: field, value and remedy, if making it raised `InvalidInput`.
     """
 
     reason: str
@@ -71,7 +71,7 @@ class Trouble(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """To the order `ticket`: environments that returned something, and those that failed."""
+    """The answer to order `ticket`: results and troubles by environment."""
 
     ticket: int
     results: dict[int, Any]
@@ -79,20 +79,20 @@ class Answer(NamedTuple):
 
 
 class Unusable(ValueError):
-    """A simulator returned what no agent can use; the message says what."""
+    """A simulator returned a value that no agent can use; the message names it."""
 
 
 class NotBuilt(Exception):
-    """Its cause was raised while a simulator was being made."""
+    """Wraps an exception that was raised while a simulator was being made."""
 
 
 def control_fields(workers: int) -> Fields:
-    """What every worker is doing: the environment, and since when (`time.monotonic`)."""
+    """The environment that each worker is calling, and since when (`time.monotonic`)."""
     return {"environment": ((workers,), np.int64), "began": ((workers,), np.float64)}
 
 
 def array_fields(workers: int, num_envs: int, obs: PyTree, action_size: int) -> Fields:
-    """All that is in memory of both; each environment has a row of its own."""
+    """All arrays in shared memory, with one row per environment."""
     step = {
         "action": ((num_envs, action_size), np.float32),
         "reward": ((num_envs,), np.float32),
@@ -104,14 +104,14 @@ def array_fields(workers: int, num_envs: int, obs: PyTree, action_size: int) -> 
 
 
 def leaves(obs: PyTree) -> list[tuple[str, Any, Any]]:
-    """(name, key, array) of each array in an observation, by key; that of a single is None."""
+    """(name, key, array) of each array in an observation, sorted by key; key None if single."""
     if isinstance(obs, dict):
         return [(f"obs[{key!r}]", key, obs[key]) for key in sorted(obs)]
     return [("obs", None, obs)]
 
 
 class Worker:
-    """Some environments, and how each order is carried out for one of them."""
+    """Some environments, with one method for each kind of order."""
 
     def __init__(self, index: int, workers: int, num_envs: int, channel: Channel, file: int):
         self.index, self.workers, self.num_envs = index, workers, num_envs
@@ -142,12 +142,12 @@ class Worker:
         return Answer(ticket, results, troubles)
 
     def note(self, env: int) -> None:
-        """Says which environment is being called, should the call never return."""
+        """Records which environment is being called, in case the call never returns."""
         self.control["environment"][self.index] = env
         self.control["began"][self.index] = time.monotonic()
 
     def build(self, env: int, factory: bytes) -> Description:
-        """Makes the simulator, each from its own copy."""
+        """Makes the simulator, from its own copy of the factory."""
         try:
             simulator = pickle.loads(factory)()
             self.description = describe_simulator(simulator)
@@ -157,11 +157,11 @@ class Worker:
         return self.description
 
     def begin(self, env: int, seed: int) -> None:
-        """Begins the episode of a seed."""
+        """Starts the episode of a seed."""
         self.write(env, Outcome(self.simulators[env].reset(seed), 0.0, False, False))
 
     def step(self, env: int, seed: int | None) -> None:
-        """One step with the action in memory; where there is a seed, begins its episode."""
+        """Steps with the action in memory; if there is a seed, starts its episode instead."""
         if seed is None:
             action = self.action(self.arrays["action"][env])
             self.write(env, self.simulators[env].step(action))
@@ -169,7 +169,7 @@ class Worker:
             self.begin(env, seed)
 
     def replay(self, env: int, episode: tuple[int, np.ndarray]) -> None:
-        """Plays an episode up to its last action: its seed and `[length, action_size]`."""
+        """Replays an episode, given its seed and its actions `[length, action_size]`."""
         seed, actions = episode
         self.begin(env, seed)
         for count, action in enumerate(actions, start=1):
@@ -178,10 +178,11 @@ class Worker:
             if count == len(actions):
                 self.write(env, outcome)
             elif outcome.is_last:
-                raise Unusable(f"the episode ended after {count} of {len(actions)} steps")
+                ended = f"the replayed episode ended after {count} of {len(actions)} steps"
+                raise Unusable(ended)
 
     def close(self, env: int, _: None = None) -> None:
-        """Lets go of the simulator, whatever it says."""
+        """Closes the simulator and ignores its errors."""
         simulator = self.simulators.pop(env, None)
         if simulator is not None:
             with contextlib.suppress(BaseException):
@@ -189,7 +190,7 @@ class Worker:
 
     @functools.cached_property
     def arrays(self) -> dict[str, np.ndarray]:
-        """Memory of both; the pool has made room before the first episode begins."""
+        """The shared arrays; the pool allocates them before the first episode."""
         obs, action_size = self.description[:2]
         return view(self.file, array_fields(self.workers, self.num_envs, obs, action_size))
 
@@ -199,14 +200,14 @@ class Worker:
         return [(*leaf, self.arrays[leaf[0]]) for leaf in leaves(self.description.obs)]
 
     def action(self, raw: np.ndarray) -> np.ndarray | int:
-        """What a simulator gets for a raw action `[action_size]`; NaN counts as 0."""
+        """Converts a raw action `[action_size]` for the simulator; NaN counts as 0."""
         action = np.where(np.isnan(raw), np.float32(0), raw)
         if self.description.discrete:
             return int(np.argmax(action))
         return np.clip(action, -1, 1)
 
     def write(self, env: int, outcome: Outcome) -> None:
-        """Passes an outcome on once all of it is known to be sound."""
+        """Writes an outcome to shared memory, after checking all of it."""
         reward = check_reward(outcome.reward)
         for name in ("is_last", "is_terminal"):
             flag = getattr(outcome, name)
@@ -222,7 +223,7 @@ class Worker:
         self.arrays["is_terminal"][env] = outcome.is_terminal
 
     def entry(self, obs: PyTree, key: Any) -> Any:
-        """`obs`, or its entry `key` where an observation is a dict."""
+        """`obs`, or its entry `key` if observations are dicts."""
         if key is None:
             return obs
         if not isinstance(obs, Mapping) or len(obs) != len(self.obs) or key not in obs:
@@ -232,10 +233,10 @@ class Worker:
 
 
 def describe_simulator(simulator: Simulator) -> Description:
-    """What it says of itself.
+    """Reads and checks the attributes of a simulator.
 
     Raises:
-      TypeError: names what is not as `Simulator` says.
+      TypeError: names an attribute that does not follow `Simulator`.
     """
     said = Description(*(getattr(simulator, name) for name in Description._fields))
     for name, key, spec in leaves(said.obs):
@@ -254,25 +255,25 @@ def describe_simulator(simulator: Simulator) -> Description:
 
 
 def check_reward(reward: Any) -> float:
-    """A number that float32 can hold.
+    """Checks that a reward is a number in the range of float32.
 
     Raises:
-      Unusable: says what it is instead.
+      Unusable: names the wrong value.
     """
     if isinstance(reward, np.ndarray) and reward.ndim == 0:
         reward = reward[()]
     if not isinstance(reward, (int, float, np.floating, np.integer, np.bool_)):
         raise Unusable(f"reward is {reward!r:.100}, not a number")
     if not abs(number := float(reward)) <= LARGEST:
-        raise Unusable(f"reward is {number}")
+        raise Unusable(f"reward is {number}, not a finite float32")
     return number
 
 
 def check_array(name: str, value: Any, spec: ArraySpec) -> None:
-    """An array as its spec says, and finite.
+    """Checks that an array follows its spec and is finite.
 
     Raises:
-      Unusable: says what it is instead.
+      Unusable: names the wrong type, dtype, shape or value.
     """
     if not isinstance(value, np.ndarray):
         raise Unusable(f"{name} is a {type(value).__name__}, not a numpy array")
@@ -282,11 +283,11 @@ def check_array(name: str, value: Any, spec: ArraySpec) -> None:
         )
     if value.dtype.kind == "f" and not (finite := np.isfinite(value)).all():
         where = np.argwhere(~finite)[0].tolist()
-        raise Unusable(f"{name}{where or ''} is {value[tuple(where)]}")
+        raise Unusable(f"{name}{where or ''} is {value[tuple(where)]}, not finite")
 
 
 def describe(error: BaseException) -> Trouble:
-    """An exception, in a form that can be sent."""
+    """Turns an exception into a `Trouble`, which can be sent."""
     building = isinstance(error, NotBuilt)
     cause = (error.__cause__ if building else None) or error
     reason = str(cause) if isinstance(cause, Unusable) else f"raised {one_line(cause)}"
@@ -302,13 +303,13 @@ def describe(error: BaseException) -> Trouble:
 
 
 def one_line(error: BaseException) -> str:
-    """Name and message of an exception."""
+    """Name and message of an exception, in one line."""
     message = " ".join("".join(traceback.format_exception_only(error)).split())
     return message if len(message) <= LONGEST else f"{message[:LONGEST]}..."
 
 
 def sendable(value: Any) -> Any:
-    """`value`, or what it looks like where the pool's process may not know its type."""
+    """`value`, or its repr if the pool's process may not know its type."""
     try:
         json.dumps(value)
     except Exception:
@@ -324,13 +325,13 @@ def main() -> None:
 
 
 def serve(settings: dict[str, Any]) -> None:
-    """What the process does: it prepares, and answers until it is told to end."""
+    """Prepares the process, then answers orders until it is told to end."""
     for name in ("channel", "memory", "crash"):
         os.set_inheritable(settings[name], False)  # not for programs a simulator starts
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        # Not SIG_IGN, which the programs that a simulator starts would inherit.
+        # Not SIG_IGN: programs that a simulator starts would inherit it.
         signal.signal(number, lambda *_: None)
-    # It is in the background of a terminal, which may stop those that print.
+    # A terminal may stop background processes that print; ignore that signal.
     signal.signal(signal.SIGTTOU, signal.SIG_IGN)
     leave_a_guard()
     end_with(settings["parent"], by_kernel=settings["by_kernel"])
@@ -339,16 +340,16 @@ def serve(settings: dict[str, Any]) -> None:
     channel = Channel(socket.socket(fileno=settings["channel"]))
     place = settings["index"], settings["workers"], settings["num_envs"]
     Worker(*place, channel, settings["memory"]).serve()
-    os._exit(0)  # threads that a simulator left behind must not keep the process
+    os._exit(0)  # threads that a simulator left behind must not keep the process alive
 
 
 def leave_a_guard() -> None:
-    """Leaves a process that ends what simulators started, once this one has ended.
+    """Forks a process that, after this one ends, kills what simulators started.
 
-    It is forked before there are threads, leads a group of its own, and keeps no file open:
-    by those the pool notices that this process has ended.
+    It is forked before there are threads and leads its own process group. It keeps no file
+    open, because the pool learns from closed files that this process has ended.
     """
-    worker = os.getpid()  # leads the group of all that its simulators start
+    worker = os.getpid()  # leads the process group of everything its simulators start
     if os.fork():
         return
     os.setpgid(0, 0)
@@ -364,12 +365,13 @@ def leave_a_guard() -> None:
 
 
 def end_with(parent: int, *, by_kernel: bool) -> None:
-    """Ends this process when its parent has ended, even within a call that never returns.
+    """Ends this process when its parent has ended, even inside a call that never returns.
 
     Args:
       parent: its process id.
-      by_kernel: has Linux do it, also where the call holds on to the interpreter. Linux does
-        so when the *thread* that started the process ends, which must be the last one then.
+      by_kernel: let Linux do it, which works even if the call holds the interpreter's lock.
+        Linux acts when the *thread* that started the process ends, so use it only if that
+        is the main thread.
     """
     if by_kernel and sys.platform == "linux":
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
@@ -379,6 +381,6 @@ def end_with(parent: int, *, by_kernel: bool) -> None:
             time.sleep(WATCH_SECONDS)
         os.kill(os.getpid(), signal.SIGKILL)
 
-    if os.getppid() != parent:  # it ended before the kernel was asked
+    if os.getppid() != parent:  # the parent ended before the prctl call
         os._exit(1)
     threading.Thread(target=watch, daemon=True).start()

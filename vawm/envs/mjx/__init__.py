@@ -3,6 +3,6 @@
 import contextlib
 import io
 
-# On import mjx prints that its optional CUDA backend is missing; stdout belongs to the user.
+# On import, mjx prints that its optional CUDA backend is missing. Keep that out of stdout.
 with contextlib.redirect_stdout(io.StringIO()):
     import mujoco.mjx  # noqa: F401

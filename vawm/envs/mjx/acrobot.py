@@ -20,7 +20,7 @@ def make_task(name: str, model: mujoco.MjModel) -> Task:
     target_radius = float(model.site("target").size[0])  # m
 
     def observe(data: mjx.Data, target: Array) -> Array:
-        """Sines of both arms, their cosines, both velocities."""
+        """Sines of both arms, cosines of both arms, both velocities."""
         rotation = data.xmat[arms]
         return jnp.concatenate([rotation[:, 0, 2], rotation[:, 2, 2], data.qvel])
 
@@ -32,6 +32,6 @@ def make_task(name: str, model: mujoco.MjModel) -> Task:
 
 
 def draw(key: Key) -> Start:
-    """Both joints anywhere, at rest."""
+    """Both joints at a random angle, at rest."""
     qpos = jax.random.uniform(key, (2,), minval=-np.pi, maxval=np.pi)
     return Start(qpos, jnp.zeros(2), no_target())

@@ -30,7 +30,7 @@ def make_task(name: str, model: mujoco.MjModel) -> Task:
 
 
 def draw(key: Key) -> Start:
-    """The ball anywhere in x U(-0.2, 0.2), z U(0.2, 0.5) from its default, at rest."""
+    """The ball at a random offset from its default, x U(-0.2, 0.2), z U(0.2, 0.5), at rest."""
     low, high = np.array([-0.2, 0.2], np.float32), np.array([0.2, 0.5], np.float32)
     ball = jax.random.uniform(key, (2,), minval=low, maxval=high)
     return Start(jnp.concatenate([jnp.zeros(2), ball]), jnp.zeros(4), no_target())

@@ -21,7 +21,7 @@ def make_task(name: str, model: mujoco.MjModel) -> Task:
     pole = model.body("pole_1").id
 
     def observe(data: mjx.Data, target: Array) -> Array:
-        """Cart position, cosine and sine of the pole, both velocities."""
+        """Cart position, cosine and sine of the pole's angle, both velocities."""
         rotation = data.xmat[pole]
         position = jnp.stack([data.qpos[0], rotation[2, 2], rotation[0, 2]])
         return jnp.concatenate([position, data.qvel])
@@ -46,7 +46,7 @@ def make_task(name: str, model: mujoco.MjModel) -> Task:
 
 
 def draw_hanging(key: Key) -> Start:
-    """Near the middle and pointing down: N(0, 0.01) around (0, pi)."""
+    """Cart near the middle, pole pointing down: N(0, 0.01) around (0, pi)."""
     key_qpos, key_qvel = jax.random.split(key)
     hanging = jnp.array([0.0, np.pi])
     qpos = hanging + 0.01 * jax.random.normal(key_qpos, (2,))
@@ -54,7 +54,7 @@ def draw_hanging(key: Key) -> Start:
 
 
 def draw_upright(key: Key) -> Start:
-    """Near the middle and nearly upright: U(-0.1, 0.1) m and U(-0.034, 0.034) rad."""
+    """Cart near the middle, pole nearly upright: U(-0.1, 0.1) m and U(-0.034, 0.034) rad."""
     key_qpos, key_qvel = jax.random.split(key)
     bound = np.array([0.1, 0.034], np.float32)
     qpos = jax.random.uniform(key_qpos, (2,), minval=-bound, maxval=bound)

@@ -37,11 +37,11 @@ def make_task(name: str, model: mujoco.MjModel) -> Task:
 
 
 def sampler(model: mujoco.MjModel):
-    """Limited joints uniform in their range, then the first of the settling steps.
+    """Draws limited joints uniformly in their range, then takes the first settling step.
 
-    dm_control settles for 200 steps, of which the first still uses the forces of the
-    default pose (it calls mj_step2 without mj_step1). Their effect is the same for every
-    draw: a constant velocity, computed here once by C.
+    dm_control settles for 200 steps. The first one still uses the forces of the default
+    pose (it calls mj_step2 without mj_step1). Their effect is the same for every draw: a
+    constant velocity, computed once here with C MuJoCo.
     """
     limited = model.jnt_limited.astype(bool)
     low = np.where(limited, model.jnt_range[:, 0], model.qpos0).astype(np.float32)

@@ -30,7 +30,7 @@ def make(domain: str, name: str, *, num_envs: int, action_repeat: int) -> Enviro
 
 
 def load(domain: str, name: str) -> tuple[Task, Physics]:
-    """A task and its model; the domain's module may edit leaves of the model."""
+    """Loads a task and its model; the domain's module may edit values of the model."""
     host = physics.load_host(domain)
     task = importlib.import_module(f"vawm.envs.mjx.{domain}").make_task(name, host)
     return task, physics.put(host, solver=physics.SOLVER.get(domain))
@@ -61,7 +61,7 @@ def batch(
 
     def observe(state: EnvState) -> Array:
         obs = jax.vmap(task.observe)(state.data, state.target)
-        # The data is sound by induction; only a state edited from outside can be not.
+        # The data is always finite, unless the caller edited the state.
         return jnp.where(jnp.isfinite(obs), obs, 0.0)
 
     def reset(key: Key) -> tuple[EnvState, TimeStep]:
@@ -109,16 +109,16 @@ def batch(
 def renew(
     begin: Callable[[Key], tuple[mjx.Data, Array]], state: EnvState, due: Array
 ) -> EnvState:
-    """Starts a new episode where `due`; all keys move on when any does.
+    """Starts a new episode where `due`; all keys advance if any episode starts.
 
-    An ordinary step pays nothing for it: the loop runs no iteration while nobody is due,
-    also when the whole step is vmapped over seeds (where a `lax.cond` would become a
-    select and run both sides).
+    Ordinary steps cost nothing extra: the loop runs no iteration if no environment is due,
+    even if the whole step is vmapped over seeds (a `lax.cond` would become a select and run
+    both sides).
 
     Args:
       begin: draws the first state and the target of one environment.
       state: of N environments.
-      due: `[N]` who starts anew.
+      due: `[N]` bool, which environments start a new episode.
     """
 
     def body(carry):
@@ -131,7 +131,7 @@ def renew(
             steps=jnp.where(due, 0, state.steps),
             key=key,
         )
-        due = due & ~jax.vmap(physics.healthy)(data)  # draw those again
+        due = due & ~jax.vmap(physics.healthy)(data)  # draw unhealthy ones again
         return state, due, attempt + 1
 
     def anyone_due(carry):
@@ -171,7 +171,7 @@ def simulate(
 def first_state(
     task: Task, model: mjx.Model, blank: mjx.Data, key: Key
 ) -> tuple[mjx.Data, Array]:
-    """Draws the first state of one environment and its target.
+    """Draws the first state and the target of one environment.
 
     dm_control ends a reset with a forward pass without actuation: the control is 0, and
     the solver's warm start is still 0 unless the task settles first.
@@ -218,7 +218,7 @@ def rescale(action: Array, low: np.ndarray, high: np.ndarray) -> Array:
 
 
 def select(mask: Array, on_true, on_false):
-    """`jnp.where` over the leading axis; of `mjx.Data` the fields that are kept."""
+    """`jnp.where` over the leading axis; for `mjx.Data`, on the `KEPT` fields only."""
 
     def pick(a, b):
         return jnp.where(mask.reshape(mask.shape + (1,) * (a.ndim - 1)), a, b)

@@ -13,12 +13,12 @@ from vawm.types import Array, Key
 
 TARGET_RADIUS = {"turn_easy": 0.07, "turn_hard": 0.03}  # m
 SPIN_VELOCITY = 15.0  # rad/s
-SPIN_DAMPING = 0.03  # of the hinge, N m s/rad, in place of 0.5
+SPIN_DAMPING = 0.03  # of the hinge, N m s/rad; the XML has 0.5
 PLANE = np.array([0, 2])  # x and z
 
 
 def make_task(name: str, model: mujoco.MjModel) -> Task:
-    """One of "spin" (which edits the hinge's damping in `model`), "turn_easy", "turn_hard"."""
+    """One of "spin" (it edits the hinge's damping in `model`), "turn_easy", "turn_hard"."""
     touch = np.array([model.sensor(side).adr[0] for side in ("touchtop", "touchbottom")])
     spinner, tip = model.body("spinner").id, model.site("tip").id
     joints = joint_sampler(model)
@@ -28,7 +28,7 @@ def make_task(name: str, model: mujoco.MjModel) -> Task:
         return (data.site_xpos[tip] - data.xpos[spinner])[PLANE]
 
     def body(data: mjx.Data) -> list[Array]:
-        """Finger angles, tip position, three velocities, log of the touch forces."""
+        """Finger angles, tip position, three velocities, log(1 + force) of both touches."""
         return [
             data.qpos[:2],
             tip_position(data),
@@ -40,7 +40,7 @@ def make_task(name: str, model: mujoco.MjModel) -> Task:
         return target - data.xpos[spinner][PLANE]
 
     def distance(data: mjx.Data, target: Array) -> Array:
-        """From the tip to the target's surface, m; negative inside."""
+        """Distance from the tip to the target's surface, m; negative inside."""
         to_target = target_position(data, target) - tip_position(data)
         return jnp.linalg.norm(to_target) - TARGET_RADIUS[name]
 
@@ -73,7 +73,7 @@ def make_task(name: str, model: mujoco.MjModel) -> Task:
 
 
 def target_sampler(model: mujoco.MjModel):
-    """The target's (x, z), m: anywhere on the circle that the spinner's tip describes."""
+    """Draws the target's (x, z), m: a random point on the circle of the spinner's tip."""
     hinge = model.body("spinner").pos + model.joint("hinge").pos
     center = hinge[PLANE].astype(np.float32)
     radius = float(model.geom("cap1").size.sum())

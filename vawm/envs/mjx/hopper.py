@@ -23,7 +23,7 @@ def make_task(name: str, model: mujoco.MjModel) -> Task:
     joints = joint_sampler(model)
 
     def observe(data: mjx.Data, target: Array) -> Array:
-        """All but the horizontal position, and the log of the two touch forces."""
+        """Everything but the horizontal position, and log(1 + force) of both touches."""
         return jnp.concatenate([data.qpos[1:], data.qvel, jnp.log1p(data.sensordata[touch])])
 
     def standing(data: mjx.Data) -> Array:

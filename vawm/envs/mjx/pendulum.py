@@ -20,7 +20,7 @@ def make_task(name: str, model: mujoco.MjModel) -> Task:
     pole = model.body("pole").id
 
     def observe(data: mjx.Data, target: Array) -> Array:
-        """Cosine and sine of the pole, its velocity."""
+        """Cosine and sine of the pole's angle, its velocity."""
         rotation = data.xmat[pole]
         return jnp.stack([rotation[2, 2], rotation[0, 2], data.qvel[0]])
 
@@ -31,6 +31,6 @@ def make_task(name: str, model: mujoco.MjModel) -> Task:
 
 
 def draw(key: Key) -> Start:
-    """Any angle, at rest."""
+    """A random angle, at rest."""
     qpos = jax.random.uniform(key, (1,), minval=-np.pi, maxval=np.pi)
     return Start(qpos, jnp.zeros(1), no_target())

@@ -1,7 +1,7 @@
-"""dm_control's own models on MJX: loading, one control step, and what dm_control refreshes.
+"""dm_control's models on MJX: loading, one control step, and dm_control's refresh after it.
 
-MJX itself promotes ranks; each function that calls it allows that, and only there.
-The model is an argument everywhere, so tasks of a domain share one compiled step.
+MJX relies on rank promotion; only the functions that call it allow it. The model is always
+an argument, so the tasks of a domain share one compiled step.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from mujoco import mjx
 
 from vawm.types import Array
 
-# (iterations, ls_iterations) of the Newton solver where fewer than the XML's leave the
-# one-step error against C unchanged; all other domains keep the XML's.
+# (iterations, ls_iterations) of the Newton solver, where fewer than in the XML leave the
+# one-step error against C MuJoCo unchanged. All other domains keep the XML's numbers.
 SOLVER = {"cheetah": (8, 8), "hopper": (8, 8), "walker": (8, 8)}
 
-MAX_VALUE = 1e10  # mjMAXVAL: beyond it MuJoCo itself calls a state bad
+MAX_VALUE = 1e10  # mjMAXVAL: MuJoCo treats larger states as bad
 
-# What the next step, the rewards and the observations read. Everything else in mjx.Data
-# is recomputed from these, so it is neither carried nor selected: constants in its place
-# let the compiler drop what only they need.
+# The fields that the next step, the rewards and the observations read. Everything else in
+# mjx.Data is recomputed from these, so it is neither carried nor selected. Constants replace
+# it, which lets the compiler drop computations that only it needs.
 KEPT = (
     "time",
     "qpos",
@@ -48,9 +48,9 @@ class Physics(NamedTuple):
     """A loaded model.
 
     Attributes:
-      model: for MJX; an argument of everything below.
-      blank: unbatched data as `mj_resetData` leaves it.
-      host: the same model for C.
+      model: for MJX; an argument of the functions below.
+      blank: unbatched data in the state after `mj_resetData`.
+      host: the same model for C MuJoCo.
     """
 
     model: mjx.Model
@@ -61,9 +61,9 @@ class Physics(NamedTuple):
 def load_host(domain: str) -> mujoco.MjModel:
     """Loads a domain's XML as dm_control ships it.
 
-    The files are read from the installed package without importing it, which would pull
-    in every domain and a rendering backend. The energy flag, a diagnostic that MJX
-    refuses, is cleared; integrator, timestep, cone and eulerdamp stay.
+    Reads the files of the installed package without importing it: the import would load
+    every domain and a rendering backend. Clears the energy flag, a diagnostic that MJX
+    refuses; keeps integrator, timestep, cone and eulerdamp.
     """
     spec = importlib.util.find_spec("dm_control.suite")
     if spec is None or not spec.origin:
@@ -80,7 +80,7 @@ def load_host(domain: str) -> mujoco.MjModel:
 
 @contextlib.contextmanager
 def _quiet():
-    """MuJoCo would log a deprecated attribute of cheetah.xml to a file where we stand."""
+    """Keeps MuJoCo from logging cheetah.xml's deprecated attribute to a file in the cwd."""
     previous = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda message: None)
     try:
@@ -114,8 +114,8 @@ def control_step(model: mjx.Model, data: mjx.Data, ctrl: Array, *, substeps: int
       substeps: physics steps.
 
     Returns:
-      The new state. As in dm_control everything derived from positions and velocities
-      belongs to the new state, and touch to the last substep.
+      The new state. As in dm_control, all values derived from positions and velocities
+      belong to the new state, and touch belongs to the last substep.
     """
     with jax.numpy_rank_promotion("allow"):
         data = repeat(lambda d: mjx.step(model, d), data.replace(ctrl=ctrl), substeps)
@@ -123,18 +123,18 @@ def control_step(model: mjx.Model, data: mjx.Data, ctrl: Array, *, substeps: int
 
 
 def coast(model: mjx.Model, data: mjx.Data, *, steps: int) -> mjx.Data:
-    """Physics steps with the control that `data` holds, then a refresh."""
+    """Takes physics steps with the control in `data`, then refreshes."""
     with jax.numpy_rank_promotion("allow"):
         data = repeat(lambda d: mjx.step(model, d), data, steps)
     return refresh(model, data)
 
 
 def refresh(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Recomputes from (qpos, qvel) what observations and rewards read (mj_step1).
+    """Recomputes what observations and rewards read from (qpos, qvel), as mj_step1.
 
-    `mjx.step` leaves it one substep behind. Velocity sensors cost three more passes and
-    are refreshed only where the model has a subtree velocity; joint sensors are read
-    from qpos and qvel instead.
+    `mjx.step` leaves these values one substep behind. Velocity sensors cost three more
+    passes and are refreshed only if the model has a subtree velocity; joint sensors are
+    read from qpos and qvel instead.
     """
     with jax.numpy_rank_promotion("allow"):
         data = mjx.kinematics(model, data)
@@ -145,7 +145,7 @@ def refresh(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 
 def forward(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """`mj_forward`, all sensors included; the solver's warm start stays untouched."""
+    """`mj_forward`, with all sensors; does not change the solver's warm start."""
     with jax.numpy_rank_promotion("allow"):
         return mjx.forward(model, data)
 
@@ -153,7 +153,7 @@ def forward(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 def collides(model: mjx.Model, data: mjx.Data) -> Array:
     """Whether any two geoms of one environment penetrate (MuJoCo's ncon > 0).
 
-    MJX keeps a slot for every candidate pair, so the count alone says nothing.
+    MJX keeps a slot for every candidate pair, so the number of contacts does not tell.
     """
     with jax.numpy_rank_promotion("allow"):
         data = mjx.collision(model, mjx.kinematics(model, data))
@@ -161,18 +161,18 @@ def collides(model: mjx.Model, data: mjx.Data) -> Array:
 
 
 def keep(blank: mjx.Data, data: mjx.Data) -> mjx.Data:
-    """`data` with all but the `KEPT` fields blank."""
+    """`data` with every field but `KEPT` reset to `blank`."""
     return blank.replace(**{name: getattr(data, name) for name in KEPT})
 
 
 def healthy(data: mjx.Data) -> Array:
-    """Whether one environment's state is finite and within MuJoCo's own limits."""
+    """Whether one environment's state is finite and within MuJoCo's limits."""
     state = jnp.concatenate([data.qpos, data.qvel, data.qacc_warmstart])
     return (jnp.abs(state) <= MAX_VALUE).all()
 
 
 def repeat(function: Callable, carry, times: int):
-    """`function` applied `times` times, compiled once."""
+    """Applies `function` `times` times; it is compiled once."""
     if times == 1:
         return function(carry)
     return jax.lax.fori_loop(0, times, lambda _, carry: function(carry), carry)

@@ -22,7 +22,7 @@ def make_task(name: str, model: mujoco.MjModel) -> Task:
     joints = joint_sampler(model)
 
     def to_target(data: mjx.Data, target: Array) -> Array:
-        """From the finger to the target in the plane, m."""
+        """Vector from the finger to the target in the plane, m."""
         return target - data.geom_xpos[finger][:2]
 
     def observe(data: mjx.Data, target: Array) -> Array:

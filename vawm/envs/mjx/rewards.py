@@ -1,4 +1,4 @@
-"""`dm_control.utils.rewards.tolerance` in JAX, the three shapes that the tasks use."""
+"""`dm_control.utils.rewards.tolerance` in JAX, with the three sigmoids that the tasks use."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def tolerance(
     value_at_margin: float = VALUE_AT_MARGIN,
     sigmoid: str = "gaussian",
 ) -> Array:
-    """1 inside `bounds`, falling to `value_at_margin` at `margin` outside of them.
+    """1 inside `bounds`; falls to `value_at_margin` at a distance of `margin` from them.
 
     Args:
       x: `[...]`, any unit; `bounds` and `margin` share it.

@@ -1,4 +1,4 @@
-"""What one module per domain provides: a `Task` of pure functions of one environment."""
+"""The `Task` that the module of each domain provides: pure functions of one environment."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ class Task(NamedTuple):
     """Observation, reward and initial states of one environment, unbatched.
 
     Attributes:
-      observe: `(data, target) -> [D]` dm_control's entries in dm_control's order.
+      observe: `(data, target) -> [D]`, dm_control's entries in dm_control's order.
       reward: `(data, target) -> []` for the state in `data`, reached with `data.ctrl`.
-      draw: `(key) -> Start` a candidate from dm_control's initial distribution.
+      draw: `(key) -> Start`, a candidate from dm_control's initial distribution.
       substeps: physics steps in one control step.
-      collision_free: whether candidates with a contact are drawn again.
+      collision_free: whether to draw again if a candidate has a contact.
       settle: physics steps without control before the first observation.
       touch: whether the first observation reads contact forces.
     """
@@ -45,15 +45,15 @@ class Task(NamedTuple):
 
 
 def no_target() -> Array:
-    """The target of a task that has none."""
+    """The empty target of a task without one."""
     return jnp.zeros((0,), jnp.float32)
 
 
 def joint_sampler(model: mujoco.MjModel) -> Callable[[Key], Array]:
-    """`randomize_limited_and_rotational_joints` of dm_control for hinges and slides.
+    """dm_control's `randomize_limited_and_rotational_joints` for hinges and slides.
 
-    Limited joints are uniform in their range, unlimited hinges in [-pi, pi], unlimited
-    slides stay where the model has them.
+    Limited joints are uniform in their range and unlimited hinges in [-pi, pi]; unlimited
+    slides keep the model's default.
     """
     hinge = model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE
     limited = model.jnt_limited.astype(bool)

@@ -22,7 +22,7 @@ def make_task(name: str, model: mujoco.MjModel) -> Task:
     target_speed = MOVE_SPEED[name]
 
     def observe(data: mjx.Data, target: Array) -> Array:
-        """Cosine and sine of each body, the torso's height, all velocities."""
+        """Cosine and sine of each body's angle, the torso's height, all velocities."""
         rotation = data.xmat[1:]
         orientations = jnp.stack([rotation[:, 0, 0], rotation[:, 0, 2]], axis=1).ravel()
         return jnp.concatenate([orientations, data.xpos[torso][2:], data.qvel])

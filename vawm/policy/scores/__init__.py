@@ -1,4 +1,4 @@
-"""Published scores to compare with, and the numbers that sum up Atari 100k.
+"""Published scores to compare with, and the aggregate numbers of Atari 100k.
 
     table                rows                        from
     atari100k            26 games                    the paper, Table 1
@@ -8,11 +8,12 @@
     dmc_proprio_500k     18 tasks, 500K frames       score files published with the agents;
                                                      the rerun from the paper, Table 2, right
 
-`_var` is an agent with value alignment, as the paper has it. `dreamerv3` and `storm` in the
-first table are the paper's own runs, `_reproduced` in the second and third, where `_reported`
-is what the agents' authors print and `storm_meo2024` what Meo et al. (2024) do.
-Of dmc_proprio_500k's rerun 15 tasks can be read in print, with value alignment none; over all
-18 the paper prints means of 805 without and 817 with it, and medians of 881 and 901.
+Columns that end in `_var` are agents with value alignment, from the paper. `dreamerv3` and
+`storm` in the first table are the paper's own runs; the second and third table call these
+`_reproduced`. `_reported` is what the agents' authors print, `storm_meo2024` what Meo et al.
+(2024) print. For the rerun of dmc_proprio_500k, the paper prints 15 tasks without value
+alignment and no task with it; over all 18 tasks it prints means of 805 without and 817 with
+value alignment, and medians of 881 and 901.
 BattleZone's human score is 37187.7 in the paper's tables, 37187.5 in most others.
 """
 
@@ -35,12 +36,12 @@ TABLES = tuple(sorted(file.name[:-4] for file in FILES.iterdir() if file.name.en
 
 
 class Game(NamedTuple):
-    """What a score in one game is measured against.
+    """The reference scores of one game.
 
     Attributes:
       name: as printed, "BankHeist".
       random: score of uniformly random play.
-      human: score of the human.
+      human: human score.
     """
 
     name: str
@@ -49,13 +50,13 @@ class Game(NamedTuple):
 
 
 class Aggregate(NamedTuple):
-    """Human-normalised scores of some games, summed up.
+    """Aggregate human-normalised scores over games.
 
     Attributes:
       mean: over the games.
       median: over the games.
-      superhuman: games with more than the human's score.
-      games: how many there are; only 26 compare with what is published.
+      superhuman: number of games above the human score.
+      games: number of games; only all 26 compare with published numbers.
     """
 
     mean: float
@@ -65,10 +66,10 @@ class Aggregate(NamedTuple):
 
 
 def table(name: str) -> dict[str, dict[str, float]]:
-    """Reads a table: row -> column -> score, with nothing where nothing is printed.
+    """Reads a table: row -> column -> score; scores that are not printed are left out.
 
     Args:
-      name: one of `TABLES`. Games are named as printed, tasks of DMC as everywhere here.
+      name: one of `TABLES`. Games are named as printed, DMC tasks as in this package.
 
     Raises:
       InvalidInput: an unknown name.
@@ -88,11 +89,11 @@ def table(name: str) -> dict[str, dict[str, float]]:
 
 
 def human_normalized(game: str, score: float, *, table: str = "atari100k") -> float:
-    """(score - random) / (human - random): 0 for random play, 1 for the human's.
+    """(score - random) / (human - random): 0 for random play, 1 for a human.
 
     Args:
       game: as a task, "bank_heist", or as printed, "BankHeist".
-      score: mean return of whole games, in the game's own points.
+      score: mean return of whole games, in the game's points.
       table: one with the columns `random` and `human`.
 
     Raises:
@@ -100,16 +101,16 @@ def human_normalized(game: str, score: float, *, table: str = "atari100k") -> fl
     """
     _, random, human = find_game(game, table)
     if not math.isfinite(score):
-        raise InvalidInput(game, score, "a score has to be a finite number")
+        raise InvalidInput(game, score, "give a finite score")
     return (score - random) / (human - random)
 
 
 def aggregate(scores: Mapping[str, float]) -> Aggregate:
-    """Sums up the human-normalised scores of games, named as in `human_normalized`.
+    """Aggregates the human-normalised scores of games, named as in `human_normalized`.
 
     Raises:
-      InvalidInput: an unknown game, no game, one under both of its names, or a score that
-        is not finite.
+      InvalidInput: an unknown game, no game, one game under both of its names, or a score
+        that is not finite.
     """
     if not scores:
         raise InvalidInput("scores", scores, "give the score of at least one game")
@@ -127,7 +128,7 @@ def aggregate(scores: Mapping[str, float]) -> Aggregate:
 
 
 def find_game(name: str, of: str = "atari100k") -> Game:
-    """The game of either name in a table; refuses others, with the nearest one."""
+    """The game with either name in a table; refuses others and suggests the nearest one."""
     for task, game in games(of).items():
         if name in (task, game.name):
             return game
@@ -136,7 +137,7 @@ def find_game(name: str, of: str = "atari100k") -> Game:
 
 @functools.cache
 def games(of: str = "atari100k") -> dict[str, Game]:
-    """The games of a table by the name of their task."""
+    """The games of a table by task name."""
     return {
         snake_case(name): Game(name, row["random"], row["human"])
         for name, row in table(of).items()
@@ -149,6 +150,6 @@ def snake_case(name: str) -> str:
 
 
 def remedy(name: str, known: Iterable[str]) -> str:
-    """What to write instead of an unknown name: the nearest known one, or any."""
+    """What to write instead of an unknown name: suggests the nearest one and lists all."""
     choices = list(known)
     return f"{suggestion(name, choices)}choose one of {', '.join(choices)}"

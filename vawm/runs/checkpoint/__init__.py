@@ -1,24 +1,24 @@
-"""Checkpoints: the whole of a run's state, checked file by file and leaf by leaf.
+"""Checkpoints of the complete state of a run, checked file by file and leaf by leaf.
 
     <logdir>/checkpoints/<env_steps>/
-        params/          Orbax: what is needed to act
-        model_state/     Orbax: and what the world model carries beside it, if anything
+        params/          Orbax: the parameters, needed to act
+        model_state/     Orbax: the world model's state besides them, if it has one
         state/           Orbax: everything else (optimiser, replay, environments, keys, ...)
-        images/          Orbax: replayed images, where they are kept on the host
-        episodes/        Orbax: what environments on the host did since their last reset
+        images/          Orbax: replayed images, if they are kept on the host
+        episodes/        Orbax: the running episodes of environments on the host
         manifest.json    config, environment spec, counters, leaves, SHA-256 of every file
         manifest.sha256
-    <logdir>/checkpoints/damaged-<env_steps>/     one that a resumed run has set aside
+    <logdir>/checkpoints/damaged-<env_steps>/     damaged, renamed by a resumed run
 
-A checkpoint is written under a temporary name and renamed when it is complete, and older
-ones are deleted after that, all but `Config.keep_checkpoints`, so a complete one exists at
-every moment. What is read is compared with its checksums first; where the newest is damaged,
-the newest one that is whole takes its place, with a warning.
+A checkpoint is written under a temporary name and renamed when it is complete. Then older ones
+are deleted, except the newest `Config.keep_checkpoints`, so a complete one always exists.
+Reading compares checksums first. If the newest checkpoint is damaged, the newest undamaged one
+is used, with a warning.
 
-Orbax ignores the target's shape and casts dtypes silently, so every leaf is compared with
-the manifest, and the manifest with what Orbax finds, before anything is allocated. Leaves
-are stored flat, named by their path in the tree; typed PRNG keys are stored as their data,
-and empty arrays, which Orbax refuses, in the manifest alone. Nothing is ever unpickled.
+Orbax ignores the target's shape and casts dtypes silently, so before anything is allocated
+every leaf is compared with the manifest, and the manifest with what Orbax finds. Leaves are
+stored flat, named by their path in the tree. Typed PRNG keys are stored as their data; empty
+arrays, which Orbax refuses, are stored only in the manifest. Nothing is ever unpickled.
 """
 
 from vawm.runs.checkpoint.folders import (

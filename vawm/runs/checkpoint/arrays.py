@@ -1,4 +1,4 @@
-"""Named arrays of numpy in a folder, by Orbax; what does not fit its description is refused."""
+"""Named numpy arrays in a folder, stored by Orbax and compared with the manifest."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ import orbax.checkpoint as ocp
 from vawm.runs.checkpoint.manifest import Damaged, LeafInfo
 
 REGISTRY = ocp.type_handlers.create_type_handler_registry(
-    # A snapshot is a copy already; Orbax would make another.
+    # A snapshot is already a copy; Orbax would make another.
     (np.ndarray, ocp.type_handlers.NumpyHandler(deepcopy_host_arrays=False)),
-    (jax.Array, ocp.type_handlers.ArrayHandler()),  # never used; Orbax warns without it
+    (jax.Array, ocp.type_handlers.ArrayHandler()),  # unused; Orbax warns without it
 )
 
 
 def write(path: pathlib.Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Writes `arrays`, none of them empty, into the new folder `path`."""
+    """Writes `arrays`, none of them empty, to the new folder `path`."""
     with _checkpointer() as checkpointer:
         checkpointer.save(path, args=ocp.args.PyTreeSave(dict(arrays)))
 
 
 def read(path: pathlib.Path, expected: Mapping[str, LeafInfo]) -> dict[str, np.ndarray]:
-    """The arrays in `path`, which are exactly those expected.
+    """Reads the arrays in `path`, which must be exactly those expected.
 
-    Shapes and dtypes are compared with what Orbax wrote beside the numbers, before memory
-    is taken for them: a few bytes can stand for an array of any size.
+    Compares shapes and dtypes with Orbax's metadata before memory is allocated, because a
+    few bytes can expand to an array of any size.
 
     Raises:
-      Damaged: it cannot be read, or holds other arrays.
+      Damaged: the folder cannot be read, or holds other arrays.
     """
     try:
         with _checkpointer() as checkpointer:
@@ -46,22 +46,22 @@ def read(path: pathlib.Path, expected: Mapping[str, LeafInfo]) -> dict[str, np.n
             )
     except Damaged:
         raise
-    except Exception as error:  # Orbax and TensorStore have no error of their own
+    except Exception as error:  # Orbax and TensorStore have no error class
         first = (str(error).strip() or repr(error)).splitlines()[0]
         raise Damaged(path, f"cannot be read ({first[:200]})") from error
     for name, info in expected.items():
         if (arrays[name].shape, str(arrays[name].dtype)) != (info.shape, info.dtype):
-            raise Damaged(path, f"holds another {name} than the manifest says")
+            raise Damaged(path, f"holds {name} with a shape or dtype not in the manifest")
     return arrays
 
 
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
-    """Keeps Orbax and what it runs on from logging, for the whole process.
+    """Keeps Orbax and its libraries from logging, for the whole process.
 
-    Where it cannot write, it logs a trace for every array, hundreds of lines on a full disk,
-    and raises the error as well. TensorStore then has more to tell to a loop that Orbax has
-    closed, some of it later: after an error these traces stay unheard for good.
+    If Orbax cannot write, it logs a trace for every array (hundreds of lines on a full disk)
+    and raises the error as well. TensorStore then reports to an event loop that Orbax has
+    closed, sometimes later: after an error, these traces are suppressed for good.
     """
     loggers = [logging.getLogger(name) for name in ("absl", "asyncio")]
     for logger in loggers:
@@ -80,7 +80,7 @@ def _nothing(record: logging.LogRecord) -> bool:
 
 
 def _but_closed_loops(hook: Callable[[Any], object]) -> Callable[[Any], object]:
-    """A `sys.unraisablehook` that passes on to `hook` all but what a closed loop is told."""
+    """A `sys.unraisablehook` that drops errors of closed event loops and calls `hook`."""
 
     def hear(unraisable: Any) -> None:
         error = unraisable.exc_value
@@ -92,7 +92,7 @@ def _but_closed_loops(hook: Callable[[Any], object]) -> Callable[[Any], object]:
 
 def _compare(path: pathlib.Path, found: Any, expected: Mapping[str, LeafInfo]) -> None:
     if not isinstance(found, dict) or found.keys() != expected.keys():
-        raise Damaged(path, "holds other arrays than the manifest says")
+        raise Damaged(path, "holds other arrays than its manifest lists")
     for name, info in expected.items():
         actual = LeafInfo(tuple(found[name].shape), str(np.dtype(found[name].dtype)))
         storage = found[name].storage
@@ -101,7 +101,7 @@ def _compare(path: pathlib.Path, found: Any, expected: Mapping[str, LeafInfo]) -
             part <= whole for part, whole in zip(chunk, info.shape, strict=True)
         )
         if actual != info or not fits:
-            raise Damaged(path, f"holds {name} as {actual}, the manifest says {info}")
+            raise Damaged(path, f"holds {name} as {actual}, but its manifest lists {info}")
 
 
 def _checkpointer() -> ocp.Checkpointer:

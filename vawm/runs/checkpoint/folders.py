@@ -1,4 +1,4 @@
-"""Where the checkpoints of a run are, which of them stay, and under which names."""
+"""The folders of a run's checkpoints: their names, listing, and deletion."""
 
 from __future__ import annotations
 
@@ -9,24 +9,24 @@ import shutil
 from vawm.errors import InvalidInput
 
 SCRATCH, DAMAGED = "tmp-", "damaged-"
-"""What the names begin with of one that is not complete, and of one that was set aside."""
+"""Prefixes of the names of incomplete checkpoints and of damaged ones that were renamed."""
 
 
 def root(logdir: str | os.PathLike[str]) -> pathlib.Path:
-    """Where the checkpoints of a run are."""
+    """The folder of all checkpoints of a run."""
     return pathlib.Path(logdir).expanduser().absolute() / "checkpoints"
 
 
 def folder(logdir: str | os.PathLike[str], env_steps: int) -> pathlib.Path:
-    """Where the checkpoint at `env_steps` is, or will be."""
+    """The folder of the checkpoint at `env_steps`, which need not exist."""
     return root(logdir) / f"{env_steps:012d}"
 
 
 def complete(logdir: str | os.PathLike[str]) -> list[pathlib.Path]:
-    """All that have been completed, the newest first; whether they are whole is not asked.
+    """All complete checkpoints, newest first; does not check them for damage.
 
     Raises:
-      InvalidInput: nobody here may look into the folder.
+      InvalidInput: no permission to read the folder.
     """
     folder = root(logdir)
     try:
@@ -45,18 +45,18 @@ def _is_step(name: str) -> bool:
 
 
 def latest(logdir: str | os.PathLike[str]) -> pathlib.Path | None:
-    """The newest complete checkpoint, or None; `find` tells whether it is whole."""
+    """The newest complete checkpoint, or None; `find` also checks for damage."""
     return next(iter(complete(logdir)), None)
 
 
 def kept(logdir: str | os.PathLike[str]) -> str:
-    """What there is to go on from, for a message."""
+    """Describes the newest checkpoint, for a message."""
     newest = latest(logdir)
     return f"the checkpoint at {int(newest.name)}" if newest else "no checkpoint yet"
 
 
 def set_aside(path: pathlib.Path) -> pathlib.Path:
-    """Renames a damaged checkpoint, so that no run meets it again; returns its new place.
+    """Renames a damaged checkpoint, so that no run reads it again; returns the new path.
 
     Raises:
       OSError: it cannot be renamed.
@@ -70,9 +70,9 @@ def set_aside(path: pathlib.Path) -> pathlib.Path:
 
 
 def prune(logdir: str | os.PathLike[str], keep: int) -> None:
-    """Deletes all but the newest `keep`, and what a killed run left unfinished.
+    """Deletes all but the newest `keep` checkpoints, and the incomplete ones of killed runs.
 
-    One that goes is renamed first, so that half of it is never taken for a checkpoint.
+    Renames a checkpoint before deleting it, so that a partly deleted one is never used.
     """
     for path in complete(logdir)[keep:]:
         try:

@@ -1,4 +1,4 @@
-"""Whether the files of a checkpoint are those that its manifest names."""
+"""Compares the files of a checkpoint with its manifest."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from vawm.runs.checkpoint.manifest import Damaged, Manifest, item_of, sha256
 
 
 def verify(folder: pathlib.Path, manifest: Manifest, items: Collection[str]) -> None:
-    """Compares every file of `items` with its checksum; the cheap comparisons come first.
+    """Compares every file of `items` with its size and checksum; cheap comparisons first.
 
     Raises:
-      Damaged: the first file that is missing, cut short, changed, a link to elsewhere, or
-        not in the manifest.
+      Damaged: names the first file that is missing, truncated, changed, a link, or not in
+        the manifest.
     """
     files = {name: file for name, file in manifest.files.items() if item_of(name) in items}
     for name, (size, _) in files.items():
@@ -33,7 +33,7 @@ def verify(folder: pathlib.Path, manifest: Manifest, items: Collection[str]) -> 
 
 
 def _refuse_others(folder: pathlib.Path, manifest: Manifest, items: Collection[str]) -> None:
-    """Refuses files that nothing is known of, since Orbax might read them."""
+    """Refuses files that are not in the manifest, because Orbax might read them."""
     for item in items:
         for where, _, names in os.walk(folder / item):
             for name in names:
@@ -43,7 +43,7 @@ def _refuse_others(folder: pathlib.Path, manifest: Manifest, items: Collection[s
 
 
 def _size(folder: pathlib.Path, name: str) -> int:
-    """Bytes of a regular file that is in the folder itself, not behind a symbolic link."""
+    """Size in bytes of a regular file in the folder; refuses symbolic links."""
     path = folder
     for part in ("", *pathlib.PurePosixPath(name).parts):
         path = path / part

@@ -1,4 +1,4 @@
-"""A tree as named leaves, and the items of a checkpoint that they belong to."""
+"""The named leaves of a tree, and the checkpoint item that each belongs to."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ PREFIXES = {
     "images": ".images",
     "state": "",
 }
-"""Item -> what its paths begin with; the first that fits has a leaf."""
-ON_HOST = ("images", EPISODES)  # these stay arrays of numpy
+"""Item -> prefix of its paths; a leaf belongs to the first item whose prefix it has."""
+ON_HOST = ("images", EPISODES)  # items whose leaves stay numpy arrays
 
 Leaves = dict[str, Any]
 
 
 def flatten(tree: PyTree) -> Leaves:
-    """Every leaf of `tree` by its path, such as `.learner.params.actor['bias']`."""
+    """The leaves of `tree` by path, such as `.learner.params.actor['bias']`."""
     pairs, _ = jax.tree_util.tree_flatten_with_path(tree)
     leaves = {jax.tree_util.keystr(path): leaf for path, leaf in pairs}
     if len(leaves) != len(pairs):
@@ -34,12 +34,12 @@ def flatten(tree: PyTree) -> Leaves:
 
 
 def unflatten(target: PyTree, leaves: Leaves) -> PyTree:
-    """The inverse of `flatten`, in the tree of `target`."""
+    """The inverse of `flatten`; returns a tree like `target`."""
     return jax.tree.unflatten(jax.tree.structure(target), [leaves[k] for k in flatten(target)])
 
 
 def items(leaves: Leaves) -> dict[str, Leaves]:
-    """Leaves by item, their paths without its prefix; items without leaves are left out."""
+    """Groups leaves by item and drops its prefix from their paths; omits empty items."""
     result: dict[str, Leaves] = {}
     for path, leaf in leaves.items():
         item = next(item for item, prefix in PREFIXES.items() if path.startswith(prefix))
@@ -50,7 +50,7 @@ def items(leaves: Leaves) -> dict[str, Leaves]:
 def compare(
     where: pathlib.Path, saved: Mapping[str, LeafInfo], expected: Mapping[str, LeafInfo]
 ) -> None:
-    """Refuses an item whose leaves are not those expected.
+    """Refuses an item with other leaves than expected.
 
     Raises:
       InvalidInput: names the first three that differ in path, shape or dtype.

@@ -1,4 +1,4 @@
-"""What a checkpoint says of itself: its config, every leaf, and a checksum per file."""
+"""The manifest of a checkpoint: its config, every leaf, and a checksum per file."""
 
 from __future__ import annotations
 
@@ -19,10 +19,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vawm import config as config_lib
 from vawm.agent import registry
 from vawm.agent.registry import UnknownAgent
-from vawm.config import Config
+from vawm.config import Config, as_dict, kinds
 from vawm.errors import InvalidInput
 from vawm.runs import suites, validate
 from vawm.types import ArraySpec, EnvSpec, PyTree
@@ -37,31 +36,31 @@ DTYPES = (
     *("int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64"),
 )
 MAX_BYTES = 2**24
-"""Of a manifest; that of a run has some 100 bytes per leaf and file."""
+"""Limit for a manifest; a usual one has about 100 bytes per leaf and file."""
 MAX_AXES = 32
 FILE_FACTOR, FILE_BYTES, LEAF_BYTES = 2, 2**20, 2**16
-"""What the files of an item may take: twice its leaves, and this much whatever their size."""
+"""Limit for the files of an item: factor * size of the leaves + bytes + bytes per leaf."""
 SPARSE_FACTOR = 100
-"""How many times as large as their files parameters may be: noise, which they begin as, and
-what training makes of it do not compress."""
+"""Limit for the size of parameters relative to their files: random and trained parameters do
+not compress."""
 MAX_EPISODES_BYTES = 2**32
-"""Of running episodes, whose shapes nothing but the manifest tells."""
+"""Limit for the running episodes, whose shapes are known only from the manifest."""
 
 
 class Damaged(InvalidInput):
-    """A file of a checkpoint that cannot be trusted: `path`, and `how` that is known."""
+    """A damaged file of a checkpoint: its `path`, and `how` it is damaged."""
 
     def __init__(self, path: pathlib.Path, how: str):
         remedy = (
-            f"{how}; the checkpoint is damaged: restore it from a copy, or start the run over "
-            "with --fresh"
+            f"{how}; the checkpoint is damaged: restore it from a backup, or start over with "
+            "--fresh"
         )
         super().__init__("checkpoint", str(path), remedy)
         self.path, self.how = path, how
 
 
 class OtherVersion(InvalidInput):
-    """What another version wrote: `why` this one cannot use it, and what can be done."""
+    """A file that another version wrote: `why` this one cannot use it, and the remedy."""
 
     def __init__(
         self,
@@ -73,15 +72,15 @@ class OtherVersion(InvalidInput):
         otherwise: str = "start over with --fresh",
     ):
         theirs, ours = str(written)[:40], version()
-        who = f"vawm {theirs} wrote it and this is vawm {ours}"
+        who = f"written by vawm {theirs}, this is vawm {ours}"
         if theirs == ours:
-            who = f"another state of vawm {ours} wrote it"
-        remedy = f"{why}; {who}: use the one that wrote it, or {otherwise}"
+            who = f"written by other code of vawm {ours}"
+        remedy = f"{why} ({who}); use the version that wrote it, or {otherwise}"
         super().__init__(field, str(where), remedy)
 
 
 class LeafInfo(NamedTuple):
-    """What a leaf has to look like; `impl` names the generator of a typed PRNG key."""
+    """Shape and dtype of a leaf; `impl` names the generator of a typed PRNG key."""
 
     shape: tuple[int, ...]
     dtype: str
@@ -97,15 +96,15 @@ class LeafInfo(NamedTuple):
 
 
 class Manifest(NamedTuple):
-    """One checkpoint.
+    """The description of one checkpoint.
 
     Attributes:
       version: of the package that wrote it.
-      computed: with which JAX, and on what: "jax 0.10.2 on cpu".
-      env_steps: when it was written.
+      computed: JAX's version and the device: "jax 0.10.2 on cpu".
+      env_steps: at which it was written.
       config: of the run.
       spec: of the environment.
-      progress: the host's own counters, for the runner.
+      progress: the counters of the host loop, for the runner.
       leaves: item -> path in the tree -> `LeafInfo`.
       files: path relative to the checkpoint -> (bytes, SHA-256).
     """
@@ -129,26 +128,26 @@ def version() -> str:
 
 
 def computed() -> str:
-    """With which JAX this process computes, and on what."""
+    """The JAX version and the device of this process."""
     return f"jax {jax.__version__} on {jax.devices()[0].device_kind}"
 
 
 def spec_as_dict(spec: EnvSpec) -> dict[str, Any]:
-    """`spec`, ready for JSON."""
+    """Converts `spec` for JSON."""
     return spec._asdict() | {"obs": _obs_as_dict(spec.obs)}
 
 
 def spec_from_dict(content: dict[str, Any]) -> EnvSpec:
-    """The inverse of `spec_as_dict`; ValueError or TypeError where it is none."""
-    kinds: dict[str, type | tuple[type, ...]]
-    kinds = {"task": str, "obs": dict, "action_size": int, "discrete": bool}
-    kinds |= {"num_envs": int, "action_repeat": int, "episode_length": (int, type(None))}
-    spec = _record(content, kinds)
+    """The inverse of `spec_as_dict`; ValueError or TypeError for other content."""
+    types: dict[str, type | tuple[type, ...]]
+    types = {"task": str, "obs": dict, "action_size": int, "discrete": bool}
+    types |= {"num_envs": int, "action_repeat": int, "episode_length": (int, type(None))}
+    spec = _record(content, types)
     return EnvSpec(**spec | {"obs": _obs_from_dict(spec["obs"])})
 
 
 def leaf_info(leaf: Any) -> LeafInfo:
-    """Shape and dtype of an array, of a `ShapeDtypeStruct` or of a typed PRNG key."""
+    """Shape and dtype of an array, a `ShapeDtypeStruct` or a typed PRNG key."""
     shape = tuple(leaf.shape)
     if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
         name = str(leaf.dtype)  # such as key<fry>
@@ -161,19 +160,19 @@ def config_from_dict(content: dict[str, Any], cls: type = Config) -> Any:
 
     Raises:
       InvalidInput: a field is missing or unknown, as after a change of version. The caller
-        knows which, and raises `OtherVersion`.
+        knows the versions and raises `OtherVersion`.
     """
     if not isinstance(content, dict):
-        raise InvalidInput(cls.__name__, str(content)[:40], "holds no choices")
+        raise InvalidInput(cls.__name__, str(content)[:40], "is not a dict of fields")
     names = {field.name for field in dataclasses.fields(cls)}
     for name in sorted(names ^ content.keys()):
-        verb = "was not saved" if name in names else "is not known"
+        verb = "was not saved" if name in names else "is unknown"
         raise InvalidInput(f"{cls.__name__}.{name[:40]}", content.get(name), verb)
-    hints = dict(config_lib.kinds(cls))
+    hints = dict(kinds(cls))
     if cls is Config:
         suite = content["suite"]
         if not isinstance(suite, str) or suite not in suites.SUITES:
-            raise InvalidInput("Config.suite", suite, "is not known")
+            raise InvalidInput("Config.suite", suite, "is unknown")
         row = registry.kind(_choice("Config.agent", content["agent"], str))
         hints |= {
             "env": suites.SUITES[suite].choices,
@@ -191,24 +190,24 @@ def config_from_dict(content: dict[str, Any], cls: type = Config) -> Any:
 
 
 def _choice(name: str, value: Any, hint: Any) -> Any:
-    """`value`, of the kind that the field has; what it may be is for `validate`."""
-    kinds = {float: (int, float)}.get(hint, (hint,) if isinstance(hint, type) else (str,))
-    if not isinstance(value, kinds) or (isinstance(value, bool) and hint is not bool):
-        raise InvalidInput(name, str(value)[:40], "is of another kind")
+    """`value`, if it has the field's type; `validate` checks the value."""
+    types = {float: (int, float)}.get(hint, (hint,) if isinstance(hint, type) else (str,))
+    if not isinstance(value, types) or (isinstance(value, bool) and hint is not bool):
+        raise InvalidInput(name, str(value)[:40], "has the wrong type")
     return value
 
 
 def write(folder: pathlib.Path, manifest: Manifest) -> int:
-    """Writes the manifest into `folder` with the checksums of all files found there.
+    """Writes the manifest to `folder`, with the checksums of all files there.
 
     Returns:
-      the bytes of all these files.
+      The total size of these files, in bytes.
     """
     found = [path for path in sorted(folder.rglob("*")) if path.is_file()]
     sizes = {path: path.stat().st_size for path in found}
     content = manifest._asdict() | {
         "schema": SCHEMA,
-        "config": config_lib.as_dict(manifest.config),
+        "config": as_dict(manifest.config),
         "spec": spec_as_dict(manifest.spec),
         "leaves": {
             item: {path: info._asdict() for path, info in leaves.items()}
@@ -229,15 +228,15 @@ def write(folder: pathlib.Path, manifest: Manifest) -> int:
 
 
 def sha256(path: pathlib.Path) -> str:
-    """Checksum of a file."""
+    """SHA-256 of a file, in hexadecimal."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def sync(path: pathlib.Path) -> None:
-    """Returns when a file, or the names in a folder, are on the disk and not in a buffer.
+    """Waits until a file, or the names in a folder, are on the disk (fsync).
 
-    Some file systems refuse that for folders; there it is theirs to keep the order.
+    Ignores file systems that refuse fsync for folders.
     """
     descriptor = os.open(path, os.O_RDONLY)
     try:
@@ -250,12 +249,12 @@ def sync(path: pathlib.Path) -> None:
 
 
 def read(folder: pathlib.Path) -> Manifest:
-    """The manifest in `folder`; nothing that it names is looked at.
+    """Reads the manifest in `folder`; does not look at the files that it names.
 
     Raises:
-      Damaged: it is missing, changed, too large, or describes no checkpoint of ours.
-      OtherVersion: its layout or a choice is not known, or could not be run.
-      UnknownAgent: nothing has registered its agent.
+      Damaged: it is missing, changed, too large, or not a manifest.
+      OtherVersion: its layout or a field is unknown, or its config could not be run.
+      UnknownAgent: its agent is not registered.
     """
     digest, text = _content(folder / DIGEST, 1024), _content(folder / NAME, MAX_BYTES)
     if not re.fullmatch(rb"[0-9a-f]{64}\n", digest):
@@ -265,7 +264,7 @@ def read(folder: pathlib.Path) -> Manifest:
     try:
         content = _record(json.loads(text), {"schema": int, "version": str}, whole=False)
         if content["schema"] != SCHEMA:
-            why, written = "its layout is not known", content["version"]
+            why, written = f"schema {content['schema']} is unknown", content["version"]
             raise OtherVersion("checkpoint", folder, why, written=written)
         manifest = _parse(content)
         validate.check(manifest.config)
@@ -281,7 +280,7 @@ def read(folder: pathlib.Path) -> Manifest:
 
 
 def _content(path: pathlib.Path, limit: int) -> bytes:
-    """What is in a small regular file."""
+    """The content of a small regular file."""
     try:
         status = path.lstat()
         if not stat.S_ISREG(status.st_mode):
@@ -300,10 +299,10 @@ def _first_line(error: Exception) -> str:
 
 
 def _parse(content: dict[str, Any]) -> Manifest:
-    """The manifest in plain JSON; ValueError or TypeError where it is none."""
-    kinds = {"schema": int, "version": str, "computed": str, "env_steps": int}
-    kinds |= dict.fromkeys(("config", "spec", "progress", "leaves", "files"), dict)
-    _record(content, kinds)
+    """The manifest from plain JSON; ValueError or TypeError for other content."""
+    types = {"schema": int, "version": str, "computed": str, "env_steps": int}
+    types |= dict.fromkeys(("config", "spec", "progress", "leaves", "files"), dict)
+    _record(content, types)
     leaves = {item: _leaves(item, entries) for item, entries in content["leaves"].items()}
     files = {name: _file(name, entry, leaves) for name, entry in content["files"].items()}
     _check_sizes(leaves, files)
@@ -320,19 +319,19 @@ def _parse(content: dict[str, Any]) -> Manifest:
 
 
 def _record(
-    content: Any, kinds: Mapping[str, type | tuple[type, ...]], *, whole: bool = True
+    content: Any, types: Mapping[str, type | tuple[type, ...]], *, whole: bool = True
 ) -> dict[str, Any]:
-    """`content`, a dict whose values are of these kinds, with no others if `whole`."""
+    """`content`, if it is a dict with values of these types, and no others if `whole`."""
     if not isinstance(content, dict):
-        raise ValueError(f"{str(content)[:40]!r} where {', '.join(kinds)} are expected")
-    for name in kinds.keys() - content.keys():
+        raise ValueError(f"{str(content)[:40]!r} is not a dict of {', '.join(types)}")
+    for name in types.keys() - content.keys():
         raise ValueError(f"{name} is missing")
-    for name in content.keys() - kinds.keys() if whole else ():
-        raise ValueError(f"{name[:40]!r} is not known")
-    for name, kind in kinds.items():
+    for name in content.keys() - types.keys() if whole else ():
+        raise ValueError(f"{name[:40]!r} is unknown")
+    for name, kind in types.items():
         value = content[name]
         if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
-            raise ValueError(f"{name} is {str(value)[:40]!r}")
+            raise ValueError(f"{name} is {str(value)[:40]!r}, of the wrong type")
     return content
 
 
@@ -350,7 +349,7 @@ def _shape(value: Any) -> tuple[int, ...]:
 
 def _leaves(item: str, entries: Any) -> dict[str, LeafInfo]:
     if item not in ITEMS:
-        raise ValueError(f"item {item[:40]!r} is not known")
+        raise ValueError(f"item {item[:40]!r} is unknown")
     if not isinstance(entries, dict):
         raise ValueError(f"item {item} has no leaves")
     return {path: _leaf_info(entry) for path, entry in entries.items()}
@@ -361,14 +360,14 @@ def _leaf_info(entry: Any) -> LeafInfo:
     dtype, impl = entry["dtype"], entry["impl"]
     is_key = impl is not None and impl == dtype and re.fullmatch(r"key<\w{1,20}>", dtype)
     if not (is_key or (impl is None and dtype in DTYPES)):
-        raise ValueError(f"dtype {dtype[:40]!r} is not known")
+        raise ValueError(f"dtype {dtype[:40]!r} is unknown")
     return LeafInfo(_shape(entry["shape"]), dtype, impl)
 
 
 def _file(name: str, entry: Any, leaves: Mapping[str, Any]) -> tuple[int, str]:
     path = pathlib.PurePosixPath(name)
     if path.is_absolute() or ".." in path.parts or "\0" in name or str(path) != name:
-        raise ValueError(f"file {name[:80]!r} is outside of the checkpoint")
+        raise ValueError(f"file {name[:80]!r} is outside the checkpoint")
     if item_of(name) not in leaves or len(path.parts) < 2:
         raise ValueError(f"file {name[:80]!r} belongs to no item")
     if not isinstance(entry, list) or len(entry) != 2:
@@ -382,18 +381,20 @@ def _file(name: str, entry: Any, leaves: Mapping[str, Any]) -> tuple[int, str]:
 def _check_sizes(
     leaves: Mapping[str, Mapping[str, LeafInfo]], files: Mapping[str, tuple[int, str]]
 ) -> None:
-    """No item takes more of the disk than its leaves can need, compressed or not; and small
-    files do not unfold into huge parameters."""
+    """Refuses files that are too large for their leaves, and leaves too large for their files.
+
+    The former would fill the disk, the latter the memory.
+    """
     for item, infos in leaves.items():
         needed = sum(info.nbytes for info in infos.values())
         limit = FILE_FACTOR * needed + FILE_BYTES + LEAF_BYTES * len(infos)
         total = sum(size for name, (size, _) in files.items() if item_of(name) == item)
         if total > limit:
-            raise ValueError(f"{total} bytes of {item}, whose leaves need {limit} at most")
+            raise ValueError(f"{item} has {total} bytes in files, more than {limit}")
         if item == PARAMS and needed > SPARSE_FACTOR * total + LEAF_BYTES * len(infos):
-            raise ValueError(f"{needed} bytes of {item} cannot come of {total}")
+            raise ValueError(f"{item} has {needed} bytes, but only {total} in files")
         if item == EPISODES and needed > MAX_EPISODES_BYTES:
-            raise ValueError(f"{needed} bytes of {item}, {MAX_EPISODES_BYTES} are allowed")
+            raise ValueError(f"{item} has {needed} bytes, more than {MAX_EPISODES_BYTES}")
 
 
 def item_of(name: str) -> str:
@@ -402,7 +403,7 @@ def item_of(name: str) -> str:
 
 
 def _obs_as_dict(obs: PyTree) -> dict[str, Any]:
-    """`EnvSpec.obs`, ready for JSON: a dict of arrays is kept under "entries"."""
+    """Converts `EnvSpec.obs` for JSON: a dict of arrays is stored under "entries"."""
     if isinstance(obs, dict):
         return {"entries": {name: _obs_as_dict(entry) for name, entry in obs.items()}}
     return {"shape": list(obs.shape), "dtype": str(jnp.dtype(obs.dtype))}
@@ -415,5 +416,5 @@ def _obs_from_dict(content: Any) -> PyTree:
         return {name: _obs_from_dict(entry) for name, entry in entries.items()}
     _record(content, {"shape": list, "dtype": str})
     if content["dtype"] not in DTYPES:
-        raise ValueError(f"dtype {content['dtype'][:40]!r} is not known")
+        raise ValueError(f"dtype {content['dtype'][:40]!r} is unknown")
     return ArraySpec(_shape(content["shape"]), jnp.dtype(content["dtype"]))

@@ -1,4 +1,4 @@
-"""Reading the newest checkpoint that is whole."""
+"""Reads the newest undamaged checkpoint."""
 
 from __future__ import annotations
 
@@ -13,25 +13,23 @@ import jax.numpy as jnp
 import numpy as np
 
 from vawm.errors import InvalidInput
-from vawm.runs.checkpoint import arrays, folders
-from vawm.runs.checkpoint import leaves as leaves_lib
-from vawm.runs.checkpoint import manifest as manifest_lib
+from vawm.runs.checkpoint import arrays, folders, leaves, manifest
 from vawm.runs.checkpoint.integrity import verify
 from vawm.runs.checkpoint.leaves import Leaves
 from vawm.runs.checkpoint.manifest import EPISODES, Damaged, LeafInfo, Manifest, leaf_info
 from vawm.types import PyTree
 
 ACTING = ("params", "model_state")
-"""Items that acting needs."""
+"""Items that are needed to act."""
 
 
 class Found(NamedTuple):
-    """The newest whole checkpoint of a run.
+    """The newest undamaged checkpoint of a run.
 
     Attributes:
-      path: where it is.
-      manifest: what it says of itself.
-      damaged: newer ones, and what is wrong with each.
+      path: its folder.
+      manifest: its manifest.
+      damaged: newer checkpoints, and the damage of each.
     """
 
     path: pathlib.Path
@@ -40,39 +38,39 @@ class Found(NamedTuple):
 
 
 def find(logdir: str | os.PathLike[str], items: Collection[str] | None = None) -> Found:
-    """The newest checkpoint whose files have their checksums; changes nothing.
+    """The newest checkpoint whose files match their checksums; changes nothing.
 
     Args:
       logdir: the folder of the run.
-      items: those to look at; all by default, none for the manifest alone.
+      items: items to check; all by default, none to check only the manifest.
 
     Raises:
-      InvalidInput: there is none, another version wrote it, or all are damaged, of which
-        the first damaged file is named.
+      InvalidInput: there is none, another version wrote it, or all are damaged (names the
+        first damaged file).
     """
     damaged: list[tuple[pathlib.Path, Damaged]] = []
     for path in folders.complete(logdir):
         try:
-            manifest = manifest_lib.read(path)
-            if manifest.env_steps != int(path.name):
-                raise Damaged(path, f"holds the manifest of {manifest.env_steps} env steps")
-            verify(path, manifest, manifest.leaves if items is None else items)
+            content = manifest.read(path)
+            if content.env_steps != int(path.name):
+                raise Damaged(path, f"holds the manifest of {content.env_steps} env steps")
+            verify(path, content, content.leaves if items is None else items)
         except Damaged as error:
-            if path not in folders.complete(logdir):  # its run goes on, and deletes old ones
+            if path not in folders.complete(logdir):  # a running run has deleted it
                 return find(logdir, items)
             damaged.append((path, error))
         else:
-            return Found(path, manifest, tuple(damaged))
+            return Found(path, content, tuple(damaged))
     if damaged:
         first = damaged[0][1]
-        raise Damaged(first.path, f"{first.how}; and no older checkpoint is whole")
-    state = "holds no checkpoint" if os.path.exists(logdir) else "is not there"
-    remedy = f"{state}; name the folder of a run that saved one"
+        raise Damaged(first.path, f"{first.how}, and all older checkpoints are damaged too")
+    state = "holds no checkpoint" if os.path.exists(logdir) else "does not exist"
+    remedy = f"{state}; use the folder of a run that has saved one"
     raise InvalidInput("logdir", str(logdir), remedy)
 
 
 def warning(found: Found) -> str | None:
-    """One line about the damage that was met, and what takes its place; None without."""
+    """One line about damaged checkpoints and the one used instead; None without damage."""
     if not found.damaged:
         return None
     _, error = found.damaged[0]
@@ -84,7 +82,7 @@ def warning(found: Found) -> str | None:
 
 
 def usable(logdir: str | os.PathLike[str], items: Collection[str] | None = None) -> Found:
-    """`find`, with a line in the log of `vawm` where a newer checkpoint is damaged."""
+    """`find`; also warns in the log `vawm` if a newer checkpoint is damaged."""
     found = find(logdir, items)
     if line := warning(found):
         logging.getLogger("vawm").warning(line)
@@ -92,17 +90,19 @@ def usable(logdir: str | os.PathLike[str], items: Collection[str] | None = None)
 
 
 def read_manifest(logdir: str | os.PathLike[str]) -> tuple[pathlib.Path, Manifest]:
-    """The newest checkpoint whose manifest is whole, and what it says of itself.
+    """The folder and the manifest of the newest checkpoint whose manifest is undamaged.
 
     Raises:
       InvalidInput: there is none, or all are damaged.
     """
-    path, manifest, _ = usable(logdir, ())
-    return path, manifest
+    found = usable(logdir, ())
+    return found.path, found.manifest
 
 
 def restore(logdir: str | os.PathLike[str], target: PyTree) -> tuple[PyTree, Manifest]:
-    """The newest whole checkpoint, in the tree of `target` (arrays or `ShapeDtypeStruct`s).
+    """Reads the newest undamaged checkpoint into a tree like `target`.
+
+    `target` may hold arrays or `ShapeDtypeStruct`s.
 
     Raises:
       InvalidInput: all are damaged, or a leaf differs from the target in path, shape or
@@ -113,7 +113,7 @@ def restore(logdir: str | os.PathLike[str], target: PyTree) -> tuple[PyTree, Man
 
 
 def restore_episodes(logdir: str | os.PathLike[str]) -> dict[str, np.ndarray] | None:
-    """The arrays that were saved as `episodes`; None where there are none.
+    """The arrays that were saved as `episodes`; None if there are none.
 
     Raises:
       InvalidInput: all checkpoints are damaged.
@@ -124,26 +124,26 @@ def restore_episodes(logdir: str | os.PathLike[str]) -> dict[str, np.ndarray] | 
 def restore_agent(
     logdir: str | os.PathLike[str], params: PyTree, model_state: PyTree
 ) -> tuple[tuple[PyTree, PyTree], Manifest]:
-    """What acting needs, like the two trees given; nothing else of the checkpoint is read."""
+    """Reads only what is needed to act, into trees like the two given."""
     found = usable(logdir, ACTING)
     return read_agent(found, params, model_state), found.manifest
 
 
 def read_state(found: Found, target: PyTree) -> PyTree:
-    """The state of a checkpoint whose files have been verified.
+    """Reads the state of a verified checkpoint.
 
     Raises:
       InvalidInput: a leaf differs from the target in path, shape or dtype.
     """
     result: Leaves = {}
-    for item, wanted in leaves_lib.items(leaves_lib.flatten(target)).items():
+    for item, wanted in leaves.items(leaves.flatten(target)).items():
         values = _read(found, item, wanted)
-        result |= {leaves_lib.PREFIXES[item] + name: value for name, value in values.items()}
-    return leaves_lib.unflatten(target, result)
+        result |= {leaves.PREFIXES[item] + name: value for name, value in values.items()}
+    return leaves.unflatten(target, result)
 
 
 def read_episodes(found: Found) -> dict[str, np.ndarray] | None:
-    """The episodes of a checkpoint whose files have been verified; None without any."""
+    """Reads the episodes of a verified checkpoint; None if it has none."""
     infos = found.manifest.leaves.get(EPISODES)
     if infos is None:
         return None
@@ -155,10 +155,10 @@ def read_episodes(found: Found) -> dict[str, np.ndarray] | None:
 
 
 def read_agent(found: Found, params: PyTree, model_state: PyTree) -> tuple[PyTree, PyTree]:
-    """What acting needs, of a checkpoint in which that has been verified."""
+    """Reads what is needed to act from a checkpoint with these items verified."""
     targets = dict(zip(ACTING, (params, model_state), strict=True))
     first, second = (
-        leaves_lib.unflatten(target, _read(found, item, leaves_lib.flatten(target)))
+        leaves.unflatten(target, _read(found, item, leaves.flatten(target)))
         if jax.tree.leaves(target)
         else target
         for item, target in targets.items()
@@ -169,15 +169,15 @@ def read_agent(found: Found, params: PyTree, model_state: PyTree) -> tuple[PyTre
 def _read(found: Found, item: str, expected: Leaves) -> Leaves:
     infos = {name: leaf_info(leaf) for name, leaf in expected.items()}
     saved = found.manifest.leaves.get(item, {})
-    leaves_lib.compare(found.path / item, saved, infos)
+    leaves.compare(found.path / item, saved, infos)
     stored = {name: _stored(leaf) for name, leaf in expected.items() if infos[name].nbytes}
     values = arrays.read(found.path / item, stored)
-    as_leaf = _as_array if item in leaves_lib.ON_HOST else _as_leaf
+    as_leaf = _as_array if item in leaves.ON_HOST else _as_leaf
     return {name: as_leaf(values.get(name), expected[name]) for name in infos}
 
 
 def _stored(leaf: Any) -> LeafInfo:
-    """What is stored of a leaf: itself, or the data of a typed key."""
+    """Shape and dtype in which a leaf is stored: its own, or those of a typed key's data."""
     if leaf_info(leaf).impl:
         return leaf_info(jax.eval_shape(jax.random.key_data, leaf))
     return leaf_info(leaf)
@@ -193,6 +193,6 @@ def _as_leaf(array: np.ndarray | None, like: Any) -> jax.Array:
     if leaf_info(like).impl:
         key = jax.random.wrap_key_data(jnp.array(array))
         if key.dtype != like.dtype:
-            raise ValueError(f"{like.dtype} is not the default kind of key")
+            raise ValueError(f"{like.dtype} is not the default type of key")
         return key
-    return jnp.array(array)  # a copy: the memory of numpy could not be donated
+    return jnp.array(array)  # a copy, because numpy's memory cannot be donated

@@ -1,7 +1,7 @@
-"""Saving while training goes on: a copy is taken, and a thread writes it.
+"""Saves checkpoints while training continues.
 
-blocked   wait for the save before, copy the state    the loop waits for this much
-behind    write, checksum, rename, delete old ones    in one thread, which has no JAX in it
+the loop waits for    the previous save to finish, a copy of the state
+a thread does         write, checksum, rename, delete old ones (without JAX)
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from vawm.types import EnvSpec, PyTree
 
 Log = Callable[[dict[str, Any]], None]
 SLOW, SLOW_SECONDS = 0.1, 1.0
-"""The share of the time between two saves in which training may wait for the disk, and the
-seconds up to which nobody minds."""
+"""Training may wait this fraction of the time between two saves, or this many seconds, for
+the disk before the saver warns."""
 
 
 class Pending(NamedTuple):
-    """A save that was begun; the future has what was written, and when that was done."""
+    """A save in progress; its future holds the result and the time of completion."""
 
     env_steps: int
     began: float
@@ -41,20 +41,20 @@ class Pending(NamedTuple):
 class Saver:
     """Writes the checkpoints of one run, at most one at a time; a context manager.
 
-    What goes wrong behind the loop is raised in it, by the next call of any method. On the
-    way out a save that was begun is waited for.
+    If a save fails, the next call of any method raises its error. The exit waits for a save
+    in progress.
 
     Args:
       logdir: the folder of the run.
-      config: of the run; `save_minutes` counts from here, and from each save on.
+      config: of the run; `save_minutes` counts from now, and from each save.
       spec: of the environment.
-      before: a file that has to be on the disk, as it was when a save began, before the
-        checkpoint is complete: so that a machine that fails leaves none that is ahead of it.
-      log: takes a line about each complete checkpoint, once the caller hears of it:
-        `checkpoint/bytes` of its files, `checkpoint/seconds` until it was complete and older
-        ones were deleted, `checkpoint/blocked_seconds` of those in which the caller waited.
-      say: prints a warning, the first time that a save takes so long that the next one holds
-        the caller up for more than `SLOW` of the time between the two.
+      before: a file to write to the disk, as it was when the save started, before the
+        checkpoint is complete. After a crash of the machine, no checkpoint is ahead of it.
+      log: called with a line about each complete checkpoint: `checkpoint/bytes` of its
+        files, `checkpoint/seconds` until it was complete and older ones were deleted, and
+        `checkpoint/blocked_seconds`, for which the caller waited.
+      say: prints a warning the first time that the caller waits for the previous save for
+        more than `SLOW` of the time between the two saves.
     """
 
     def __init__(
@@ -86,20 +86,20 @@ class Saver:
         progress: Mapping[str, Any],
         episodes: Mapping[str, np.ndarray] | None = None,
     ) -> None:
-        """Waits for the save before, copies the state, and has it written behind the caller.
+        """Waits for the previous save, copies the state, and writes it in the background.
 
         Raises:
-          SaveError: the save before failed, there is a checkpoint as new as this, or the
-            folder of the run is gone.
+          SaveError: the previous save failed, a checkpoint as new as this exists, or the
+            folder of the run does not exist any more.
         """
         due = time.monotonic()
         self.wait()
         began = time.monotonic()
         self._tell_if_slow(waited=began - due, interval=began - self._last)
-        if not folders.root(self.logdir).parent.is_dir():  # nobody would look for a new one
+        if not folders.root(self.logdir).parent.is_dir():  # a new folder would be overlooked
             raise SaveError(
-                f"{self.logdir} is gone, so no checkpoint is written; if it was moved, go on "
-                "with --resume where it is"
+                f"no checkpoint was written, because {self.logdir} does not exist any more; "
+                "if it was moved, resume it with --resume --logdir NEW_FOLDER"
             )
         writing.refuse_backwards(self.logdir, env_steps)
         taken = snapshot.take(
@@ -119,21 +119,21 @@ class Saver:
             return
         self._told = True
         self._say(
-            f"warning: training waited {waited:.0f} s of {interval:.0f} s for the disk, which "
-            "does not keep up: use a larger --save-every and --save-minutes"
+            f"warning: training waited {waited:.0f} s of {interval:.0f} s for the disk; save "
+            "less often: use a larger --save-every and --save-minutes"
         )
 
     def check(self) -> None:
-        """Hears of a save that is done; never waits.
+        """Handles the result of a finished save; never waits.
 
         Raises:
-          SaveError: it failed; nothing of it is left, and the one before is intact.
+          SaveError: it failed. Its files are removed, and the previous checkpoint is intact.
         """
         if self._pending and self._pending.future.done():
             self.wait()
 
     def wait(self) -> None:
-        """Returns when no save is under way.
+        """Waits until no save is in progress.
 
         Raises:
           SaveError: as `check`.
@@ -165,7 +165,7 @@ class Saver:
         try:
             self.wait()
         except (SaveError, OSError):
-            if error is None:  # else the run ends already, for a reason of its own
+            if error is None:  # otherwise the run is already ending with another error
                 raise
         finally:
             self._thread.shutdown()

@@ -1,4 +1,4 @@
-"""What a checkpoint will hold, copied at one moment, so that training can go on."""
+"""A copy of the state for a checkpoint, so that training can continue while it is written."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ import jax
 import numpy as np
 
 from vawm.config import Config
-from vawm.runs.checkpoint import leaves as leaves_lib
+from vawm.runs.checkpoint.leaves import flatten, items
 from vawm.runs.checkpoint.manifest import EPISODES, LeafInfo, leaf_info
 from vawm.types import EnvSpec, PyTree
 
 
 class Snapshot(NamedTuple):
-    """A run at one moment, in host memory of its own.
+    """A copy of a run's state in host memory.
 
     Attributes:
-      env_steps: when.
+      env_steps: at which it was taken.
       config: of the run.
       spec: of the environment.
-      progress: the host's own counters.
+      progress: the counters of the host loop.
       leaves: item -> path in the tree -> `LeafInfo`.
-      arrays: item -> path in the tree -> what is stored of it; empty leaves are left out.
+      arrays: item -> path in the tree -> the array to store; empty leaves are left out.
     """
 
     env_steps: int
@@ -47,10 +47,10 @@ def take(
     progress: Mapping[str, Any],
     episodes: Mapping[str, np.ndarray] | None = None,
 ) -> Snapshot:
-    """Copies a `TrainState`, whose memory the next step uses again, and `episodes`."""
-    items = leaves_lib.items(leaves_lib.flatten(state))
+    """Copies a `TrainState`, whose memory the next step reuses, and `episodes`."""
+    by_item = items(flatten(state))
     if episodes is not None:
-        items[EPISODES] = dict(episodes)
+        by_item[EPISODES] = dict(episodes)
     return Snapshot(
         env_steps=env_steps,
         config=config,
@@ -58,9 +58,9 @@ def take(
         progress=dict(progress),
         leaves={
             item: {path: leaf_info(leaf) for path, leaf in leaves.items()}
-            for item, leaves in items.items()
+            for item, leaves in by_item.items()
         },
-        arrays={item: _copy(leaves) for item, leaves in items.items()},
+        arrays={item: _copy(leaves) for item, leaves in by_item.items()},
     )
 
 
@@ -78,7 +78,7 @@ def _copy(leaves: Mapping[str, Any]) -> dict[str, np.ndarray]:
 
 
 def _shares_memory(leaf: Any) -> bool:
-    """Whether what `device_get` returns of `leaf` is its own memory."""
+    """Whether `device_get` returns the memory of `leaf` itself."""
     if not isinstance(leaf, jax.Array):
         return True
     return any(device.platform == "cpu" for device in leaf.devices())

@@ -1,4 +1,4 @@
-"""Writing a checkpoint: all or nothing."""
+"""Writes a checkpoint completely or not at all."""
 
 from __future__ import annotations
 
@@ -13,19 +13,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vawm.config import Config
-from vawm.runs.checkpoint import arrays, folders, snapshot
-from vawm.runs.checkpoint import manifest as manifest_lib
+from vawm.runs.checkpoint import arrays, folders, manifest, snapshot
 from vawm.runs.checkpoint.manifest import Manifest
 from vawm.runs.checkpoint.snapshot import Snapshot
 from vawm.types import EnvSpec, PyTree
 
 
 class SaveError(RuntimeError):
-    """A checkpoint could not be written; the one before it is intact."""
+    """A checkpoint could not be written; the previous one is intact."""
 
 
 class Written(NamedTuple):
-    """A complete checkpoint, and the bytes that it takes of the disk."""
+    """A complete checkpoint, and its size on disk in bytes."""
 
     path: pathlib.Path
     nbytes: int
@@ -41,9 +40,9 @@ def save(
     progress: Mapping[str, Any],
     episodes: Mapping[str, np.ndarray] | None = None,
 ) -> pathlib.Path:
-    """Writes a `TrainState` and returns when it is complete; `Saver` does not wait for that.
+    """Writes a `TrainState` and waits until the checkpoint is complete, unlike `Saver`.
 
-    `episodes` are arrays of any shape beside it, see `restore_episodes`.
+    `episodes` are further arrays of any shape, see `restore_episodes`.
 
     Raises:
       SaveError: see `write`.
@@ -60,13 +59,13 @@ def save(
 
 
 def write(logdir: str | os.PathLike[str], taken: Snapshot) -> Written:
-    """Writes a snapshot; deletes old checkpoints once the new one is complete.
+    """Writes a snapshot, then deletes old checkpoints.
 
-    Computes nothing with JAX, so any thread may call it; one at a time.
+    Does not use JAX, so any thread may call it, but only one at a time.
 
     Raises:
       SaveError: nothing was changed, because the disk is full, a parameter is not finite, or
-        there is a checkpoint at these env steps or later ones.
+        a checkpoint at these or later env steps exists.
     """
     final = folders.folder(logdir, taken.env_steps)
     refuse_backwards(logdir, taken.env_steps)
@@ -78,36 +77,36 @@ def write(logdir: str | os.PathLike[str], taken: Snapshot) -> Written:
             scratch.mkdir(parents=True)
             for item in taken.leaves:
                 arrays.write(scratch / item, taken.arrays[item])
-            nbytes = manifest_lib.write(scratch, _manifest(taken))
+            nbytes = manifest.write(scratch, _manifest(taken))
             scratch.rename(final)
-            manifest_lib.sync(final.parent)
+            manifest.sync(final.parent)
         except Exception as error:
             shutil.rmtree(scratch, ignore_errors=True)
             raise SaveError(_why_not_saved(logdir, final, taken.nbytes, error)) from error
         finally:
-            gc.collect(1)  # Orbax leaves young cycles that hold all of it, compressed
+            gc.collect(1)  # Orbax leaves reference cycles that hold all compressed data
     folders.prune(logdir, taken.config.keep_checkpoints)
     return Written(final, nbytes)
 
 
 def refuse_backwards(logdir: str | os.PathLike[str], env_steps: int) -> None:
-    """Refuses to save at or before the newest checkpoint.
+    """Refuses to save at or before the env steps of the newest checkpoint.
 
     Raises:
-      SaveError: there is one that is as new; nothing was changed.
+      SaveError: there is one at these or later env steps; nothing was changed.
     """
     newest = folders.latest(logdir)
     if newest is not None and env_steps <= int(newest.name):
         raise SaveError(
-            f"checkpoint {folders.folder(logdir, env_steps)} is not written: the newest one "
-            f"is at {int(newest.name)} env steps, and a run does not go backwards"
+            f"checkpoint {folders.folder(logdir, env_steps)} was not written, because a newer "
+            f"one exists, at {int(newest.name)} env steps"
         )
 
 
 def _manifest(taken: Snapshot) -> Manifest:
     return Manifest(
-        version=manifest_lib.version(),
-        computed=manifest_lib.computed(),
+        version=manifest.version(),
+        computed=manifest.computed(),
         env_steps=taken.env_steps,
         config=taken.config,
         spec=taken.spec,
@@ -118,12 +117,12 @@ def _manifest(taken: Snapshot) -> Manifest:
 
 
 def _refuse_nonfinite(needed: Mapping[str, np.ndarray]) -> None:
-    """What acting needs has to be finite."""
+    """Refuses parameters that are not finite."""
     for path, array in needed.items():
         if not np.isfinite(array).all():
             raise SaveError(
-                f"parameter {path} is not finite, so no checkpoint is written; start again "
-                "with a smaller --optimizer.learning-rate or another --seed"
+                f"no checkpoint was written, because parameter {path} is not finite; start "
+                "again with a smaller --optimizer.learning-rate or another --seed"
             )
 
 
@@ -131,17 +130,17 @@ def _why_not_saved(
     logdir: str | os.PathLike[str], final: pathlib.Path, needed: int, error: Exception
 ) -> str:
     reason = (str(error).strip() or repr(error)).splitlines()[0]
-    # TensorStore names file after file before what the system said, and its choices after.
+    # TensorStore lists files before the system's error, and its own options after it.
     reason = re.split(r" \[\w+='", reason)[0].rpartition('": ')[-1]
     return (
         f"checkpoint {final} could not be written (up to {amount(needed)} needed, "
         f"{free_space(final.parents[1])} free): {reason[:200]}; kept: {folders.kept(logdir)}; "
-        "put that right, then go on with --resume"
+        "fix the cause, then continue with --resume"
     )
 
 
 def free_space(folder: str | os.PathLike[str]) -> str:
-    """On the disk of `folder`, for people."""
+    """Free space on the disk of `folder`, as text."""
     try:
         return amount(shutil.disk_usage(folder).free)
     except OSError:
@@ -149,7 +148,7 @@ def free_space(folder: str | os.PathLike[str]) -> str:
 
 
 def amount(nbytes: int) -> str:
-    """Bytes for people: `"337 B"`, `"1.5 MiB"`, `"57 GiB"`."""
+    """A size in bytes as text: `"337 B"`, `"1.5 MiB"`, `"57 GiB"`."""
     size, units = float(nbytes), ["B", "KiB", "MiB", "GiB"]
     while size >= 1024 and len(units) > 1:
         size /= 1024

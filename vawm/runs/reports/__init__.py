@@ -1,1 +1,1 @@
-"""What a run tells: metrics, trackers, videos, the progress bar."""
+"""Reports of a run: metrics, trackers, videos, the progress bar."""

@@ -1,24 +1,22 @@
-"""Where else a run may report to: Weights & Biases or trackio, fed so that neither can harm it.
+"""Sends reports to Weights & Biases or trackio, without risk to the run.
 
-`metrics.jsonl` is the source of truth and TensorBoard is always written; `Config.tracker` names
-one backend more. It is opened and written to by a daemon thread that reads a bounded queue: the
-first failure, or a queue that is full, costs the run one line of warning and the backend, and
-nothing else.
+`metrics.jsonl` is the source of truth and TensorBoard is always written. `Config.tracker` adds
+one backend. A daemon thread opens it and writes to it from a bounded queue. At the first
+failure, or if the queue is full, the run prints one warning and continues without the backend.
 
-`tracker.json` in the run's folder names the remote run and the last line and video that it was
-given. A resumed run goes on in the same remote run: lines that the backend never got, such as
-those after it failed, are caught up from `metrics.jsonl`, and steps that it has are not sent
-again. A process that is killed between sending and noting that may send one line twice. What
-was sent is not taken back: the line of an incomplete interval, at the end of a run that is
-extended later, stays. The step of both backends is `env_steps`.
+`tracker.json` in the run's folder names the remote run and the last line and video sent to it.
+A resumed run continues the same remote run: it sends the missing lines from `metrics.jsonl`,
+and does not send steps again. If a process is killed between sending a line and recording it,
+one line may be sent twice. Sent lines are never deleted: if a run is extended later, the line
+of its incomplete last interval stays. The step of both backends is `env_steps`.
 
     wandb     refuses steps below its newest, so it has no line twice. It completes a step when
-              the next begins or the run ends, so a killed process costs it the last line. With
-              WANDB_MODE=offline it writes to <logdir>/wandb, one folder for each part of a run,
-              which `wandb sync` sends. WANDB_ENTITY and the other variables of its own apply.
+              the next one starts or the run ends, so a killed process loses the last line.
+              With WANDB_MODE=offline it writes to <logdir>/wandb, one folder for each part of a
+              run; `wandb sync` sends them. WANDB_ENTITY and wandb's other variables apply.
     trackio   a database on this machine (TRACKIO_DIR), or a server (TRACKIO_SPACE_ID,
-              TRACKIO_SERVER_URL); any order of steps is taken, any number of times. What lines
-              call `time` is `seconds` there.
+              TRACKIO_SERVER_URL). Accepts steps in any order and repeatedly. The field `time`
+              of a line is called `seconds` there.
 """
 
 from __future__ import annotations
@@ -33,28 +31,27 @@ import uuid
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-from vawm import config as config_lib
-from vawm.config import Config
+from vawm.config import Config, as_dict
 from vawm.errors import InvalidInput
 from vawm.runs.reports.tracking import METRICS, Backend, Line, finite, read
 
 CAPACITY = 256
-"""Lines and paths of videos that wait for a backend before it counts as too slow."""
+"""Lines and videos that may wait for a backend; if more wait, it is too slow and dropped."""
 PATIENCE, HURRIED_PATIENCE = 30.0, 5.0
-"""Seconds that the end of a run waits for what is still to be sent; the second after a signal,
-since whoever sent it may kill the process soon."""
+"""Seconds for which the end of a run waits until everything is sent. The second number applies
+after a signal, because its sender may kill the process soon."""
 RECORD = "tracker.json"
 
 
 class Feed:
-    """Hands a backend its lines in a thread; only `close` waits for it, and not for long.
+    """Writes to a backend in a thread; only `close` waits for it, for a limited time.
 
     Args:
       name: of the backend, for the warning.
       open_backend: called in the thread.
-      say: prints the one line of warning; called by whoever calls the methods.
-      capacity: what may wait; more drops the backend.
-      patience: tells, as often as asked, how many seconds `close` may wait in all.
+      say: prints the warning; called in the caller's thread.
+      capacity: entries that may wait; if more wait, the backend is dropped.
+      patience: returns the seconds that `close` may wait in total; asked repeatedly.
     """
 
     def __init__(
@@ -86,7 +83,7 @@ class Feed:
         while self._thread.is_alive() and time.monotonic() - began < self._patience():
             self._thread.join(0.1)
         if self._thread.is_alive():
-            self._drop(f"not done after {time.monotonic() - began:.0f} s at the end")
+            self._drop(f"not finished {time.monotonic() - began:.0f} s after the run's end")
         elif self._failure:
             self._drop(self._failure)
 
@@ -98,11 +95,11 @@ class Feed:
         try:
             self._calls.put_nowait(call)
         except queue.Full:
-            self._drop(f"does not keep up, {self._calls.maxsize} lines wait")
+            self._drop(f"too slow, {self._calls.maxsize} lines are waiting")
 
     def _drop(self, why: str) -> None:
         self._dropped = True
-        self._say(f"warning: {self._name} gets no more of this run ({why}); {METRICS} has all")
+        self._say(f"warning: stopped reporting to {self._name} ({why}); {METRICS} is complete")
 
     def _work(self, open_backend: Callable[[], Backend]) -> None:
         try:
@@ -110,19 +107,19 @@ class Feed:
             while (call := self._calls.get()) and not self._dropped:
                 call(backend)
             backend.close()
-        except BaseException as error:  # whatever ends this thread, the run goes on
+        except BaseException as error:  # the run must continue, whatever ends this thread
             self._failure = (str(error).strip() or repr(error)).splitlines()[0][:200]
 
 
 class Record(NamedTuple):
-    """What a backend has of a run, as `tracker.json` keeps it.
+    """What a backend has received of a run; stored in `tracker.json`.
 
     Attributes:
-      tracker: which backend.
-      project: of its.
-      run: the remote run's id.
-      line: env steps of the last line that it was given, -1 for none.
-      video: of the last videos.
+      tracker: name of the backend.
+      project: its project.
+      run: id of the remote run.
+      line: env steps of the last line sent, -1 for none.
+      video: env steps of the last video sent, -1 for none.
     """
 
     tracker: str
@@ -133,7 +130,7 @@ class Record(NamedTuple):
 
 
 class Once:
-    """Gives a backend what earlier parts of the run did not, and notes it in `tracker.json`."""
+    """Sends a backend what earlier parts of the run have not, and updates `tracker.json`."""
 
     def __init__(self, backend: Backend, logdir: pathlib.Path, record: Record):
         self._backend, self._logdir = backend, logdir
@@ -161,25 +158,25 @@ class WeightsAndBiases:
     """A run on Weights & Biases.
 
     Raises:
-      ConnectionError: nobody is logged in, and it is not told to stay offline.
+      ConnectionError: not logged in, and not set to offline mode.
     """
 
     def __init__(self, config: Config, logdir: pathlib.Path, run: str):
         import wandb
 
         online = wandb.setup().settings.mode not in ("offline", "dryrun", "disabled")
-        # Else it asks who sits at the terminal, in a thread that nobody waits for.
+        # Otherwise wandb would prompt at the terminal, from this thread.
         if online and not wandb.login(prompt=False, verify=False):
             raise ConnectionError("not logged in: `wandb login`, or set WANDB_MODE=offline")
         self._video = wandb.Video
-        # Both also bound what its own hook at the end of the process waits for.
+        # Both timeouts also limit wandb's hook at the end of the process.
         settings = wandb.Settings(console="off", init_timeout=PATIENCE, finish_timeout=PATIENCE)
         self._run = wandb.init(
             project=config.tracker_project,
             id=run,
             name=logdir.name,
             dir=str(logdir),
-            config=config_lib.as_dict(config),
+            config=as_dict(config),
             allow_val_change=True,
             resume="allow",
             settings=settings,
@@ -196,7 +193,7 @@ class WeightsAndBiases:
 
 
 class Trackio:
-    """A run in trackio, which knows it by its name; `time` is a word of its own there."""
+    """A run in trackio, identified by its name. `time` is reserved there."""
 
     def __init__(self, config: Config, logdir: pathlib.Path, run: str):
         import trackio
@@ -205,7 +202,7 @@ class Trackio:
         self._run = trackio.init(
             project=config.tracker_project,
             name=f"{logdir.name}-{run}",
-            config=config_lib.as_dict(config),
+            config=as_dict(config),
             resume="allow",
             auto_log_cpu=False,
             auto_log_gpu=False,
@@ -234,14 +231,14 @@ def check(config: Config) -> None:
     """Refuses a tracker whose package is not installed.
 
     Raises:
-      InvalidInput: with the command that installs it.
+      InvalidInput: names the command that installs it.
     """
     name = config.tracker
     if name == "none":
         return
     found = importlib.util.find_spec(name)
-    if found is None or found.origin is None:  # or a folder of that name, where wandb wrote
-        remedy = f"{name} is missing: pip install 'vawm[{name}]'"
+    if found is None or found.origin is None:  # no origin: a folder that wandb wrote
+        remedy = f"{name} is not installed: pip install 'vawm[{name}]'"
         raise InvalidInput("tracker", name, remedy)
 
 
@@ -253,14 +250,14 @@ def connect(
     say: Callable[[str], None],
     hurried: Callable[[], bool] = lambda: False,
 ) -> Sequence[Backend]:
-    """The backend that `config` names, or none; it is opened in a thread of its own.
+    """The backends that `config` names, one or none; each is opened in its own thread.
 
     Args:
       config: of the run.
-      logdir: its folder.
-      resumed: whether `metrics.jsonl` is that of an earlier part of the same run.
+      logdir: folder of the run.
+      resumed: whether `metrics.jsonl` has lines of an earlier part of the same run.
       say: prints a warning.
-      hurried: whether the run was asked to end soon.
+      hurried: returns whether a signal has asked the run to stop.
     """
     if config.tracker == "none":
         return ()
@@ -283,7 +280,7 @@ def connect(
 
 
 def _record(config: Config, logdir: pathlib.Path, *, resumed: bool) -> Record:
-    """The run's own; a new remote run's for a first part, another tracker or project."""
+    """The record of the run, or a new one for a new run, another tracker or project."""
     new = Record(config.tracker, config.tracker_project, uuid.uuid4().hex[:12])
     try:
         kept = Record(**json.loads((logdir / RECORD).read_text()))

@@ -1,4 +1,4 @@
-"""What a run shows while it runs: a bar on a terminal, a line per log elsewhere."""
+"""The progress display of a run: a bar on a terminal, otherwise a line per log entry."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import rich.progress
 from vawm.runs.reports.tracking import Interval, Line
 
 SPEED_SECONDS = 600.0
-"""How far back the speed behind the ETA looks; two chunks have to fit in, or there is none."""
+"""Window for the speed of the ETA; it must contain two chunks, otherwise there is no ETA."""
 
 
 class Display:
-    """A context manager around the loop; `console` decides what is shown."""
+    """A context manager around the loop; shows the bar if `console` is a terminal."""
 
     def __init__(self, console: rich.console.Console, *, start: int, total: int):
         self._console = console
@@ -33,7 +33,7 @@ class Display:
         self._task = self._bar.add_task("", completed=start, total=total, status="")
 
     def advance(self, env_steps: int, interval: Interval) -> None:
-        """After every chunk: where the run is, and how fast in this interval."""
+        """Updates the bar after every chunk: progress, and speed in this interval."""
         if interval.seconds:
             steps_per_s = interval.env_steps / interval.seconds
             updates_per_s = interval.updates / interval.seconds
@@ -43,14 +43,14 @@ class Display:
         self._bar.update(self._task, completed=min(env_steps, self._total), status=status)
 
     def log(self, line: Line) -> None:
-        """After every line of metrics."""
+        """Shows a line of metrics."""
         latest = line.get("episode/return")
         self._return = self._return if latest is None else latest
         if self._console.is_terminal:
             return
         shown = "-" if latest is None else f"{latest:.1f}"
         remaining = max(0, self._total - line["env_steps"]) / max(line["env_steps_per_s"], 1e-9)
-        # Steps are slower by far once there is something to learn from.
+        # Steps become much slower once updates start, so there is no estimate before.
         left = f"{remaining / 60:.0f} min left" if line["updates"] else "not learning yet"
         self._console.print(
             f"env_steps {line['env_steps']}/{self._total}  updates {line['updates']}  "
@@ -61,7 +61,7 @@ class Display:
         )
 
     def note(self, text: str) -> None:
-        """A line of text above the bar."""
+        """Prints a line of text above the bar."""
         self._console.print(text, highlight=False, soft_wrap=True, markup=False)
 
     def __enter__(self) -> Display:

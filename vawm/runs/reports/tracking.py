@@ -1,13 +1,12 @@
-"""What a run reports: means over an interval, lines of JSON, TensorBoard events.
+"""Metrics of a run: means over an interval, lines of JSON, TensorBoard events.
 
 `metrics.jsonl` is the source of truth: one strictly valid JSON object per line, written
-when the interval between two lines is complete. Means weigh every chunk by its number of
-updates; counts are sums. An `Interval` is plain numbers, so a checkpoint can carry it.
+when the interval between two lines is complete. Means weight every chunk by its number of
+updates; counts are sums. An `Interval` is plain numbers, so a checkpoint can store it.
 
-TensorBoard's file lies beside it: a full disk, which keeps both from being written, stops the
-run, because the next checkpoint would fail too. Any other failure of TensorBoard is one
-warning, and the run goes on without it. Further backends are those of
-`vawm.runs.reports.backends`.
+TensorBoard's file is next to it. A full disk stops the run, because the next checkpoint would
+fail too. At any other failure of TensorBoard, the run prints one warning and continues without
+it. `vawm.runs.reports.backends` has further backends.
 """
 
 from __future__ import annotations
@@ -35,20 +34,20 @@ Line = dict[str, Any]
 COUNTERS = ("env_steps", "updates")
 METRICS, VIDEOS, VIDEO_LINES = "metrics.jsonl", "videos", "videos.jsonl"
 SAVE_LINES = "checkpoints.jsonl"
-"""A line about every checkpoint: its size, how long it took, how long training waited."""
+"""One line per checkpoint: its size, how long saving took, how long training waited."""
 FULL = (errno.ENOSPC, errno.EDQUOT)
 EPISODE_SUMS = ("episode/return", "episode/length")
 
 
 class Interval(NamedTuple):
-    """What was measured since the last line.
+    """Measurements since the last line.
 
     Attributes:
       updates: updates in the interval.
       weighted: name -> sum over updates, for metrics that are means.
       counted: name -> sum over chunks, for metrics that are counts.
       env_steps: env steps in the interval.
-      seconds: of its steps; what lines, videos and checkpoints took is not in it.
+      seconds: of its steps, without the time for lines, videos and checkpoints.
     """
 
     updates: int = 0
@@ -59,27 +58,27 @@ class Interval(NamedTuple):
 
 
 class Backend(Protocol):
-    """Where lines go besides `metrics.jsonl`."""
+    """A destination of lines and videos besides `metrics.jsonl`."""
 
     def write(self, entry: Line) -> None:
-        """Takes one line of metrics, at step `entry["env_steps"]`."""
+        """Writes one line of metrics, at step `entry["env_steps"]`."""
 
     def write_video(self, name: str, gif: pathlib.Path, env_steps: int) -> None:
-        """Takes a video, a file that stays where it is."""
+        """Writes a video; the file `gif` stays in place."""
 
     def close(self) -> None:
-        """Takes no more."""
+        """Finishes; nothing is written afterwards."""
 
 
 def is_count(name: str) -> bool:
-    """Whether chunks add this metric up instead of averaging it."""
+    """Whether this metric is summed over chunks instead of averaged."""
     return name.startswith(("episode/", "env/"))
 
 
 def add(
     interval: Interval, metrics: Mapping[str, Any], *, env_steps: int, seconds: float
 ) -> Interval:
-    """`interval` with one chunk more; `env_steps` and `seconds` are the chunk's own."""
+    """`interval` with one more chunk; `env_steps` and `seconds` are those of the chunk."""
     updates = int(metrics["chunk/updates"])
     weighted, counted = dict(interval.weighted), dict(interval.counted)
     for name, value in metrics.items():
@@ -87,7 +86,7 @@ def add(
             continue
         if is_count(name):
             counted[name] = counted.get(name, 0.0) + float(value)
-        else:  # NaN when the chunk had no updates, so not even added
+        else:  # NaN if the chunk had no updates; then skip it
             chunk = updates * float(value) if updates else 0.0
             weighted[name] = weighted.get(name, 0.0) + chunk
     return Interval(
@@ -100,10 +99,10 @@ def add(
 
 
 def line(interval: Interval, *, env_steps: int, updates: int, seconds: float) -> Line:
-    """The line that closes `interval`; the keyword numbers are the run's totals.
+    """The line for a complete `interval`; the keyword arguments are totals of the run.
 
-    Episode metrics are means over the episodes that finished, None where none did; the
-    other means are None where nothing was updated.
+    Episode metrics are means over finished episodes, None if there are none; other means
+    are None if there were no updates.
     """
     episodes = interval.counted.get("episode/count", 0.0)
     result: Line = {"env_steps": env_steps, "updates": updates}
@@ -122,7 +121,7 @@ def line(interval: Interval, *, env_steps: int, updates: int, seconds: float) ->
 
 
 def as_json(value: Line) -> str:
-    """One line of strictly valid JSON: what is not finite becomes null."""
+    """One line of strictly valid JSON; numbers that are not finite become null."""
     return json.dumps({k: _finite_or_none(v) for k, v in value.items()}, allow_nan=False)
 
 
@@ -131,23 +130,23 @@ def _finite_or_none(value: Any) -> Any:
 
 
 def finite(entry: Line) -> Line:
-    """What is a number in a line."""
+    """The entries of a line that are finite numbers."""
     return {name: value for name, value in entry.items() if _finite_or_none(value) is not None}
 
 
 def read(path: str | os.PathLike[str]) -> list[Line]:
-    """All whole lines of a file such as `metrics.jsonl`; none where there is no such file.
+    """Reads a file such as `metrics.jsonl`; returns no lines if it does not exist.
 
-    A half-written last line is left out, and so is one that was damaged.
+    Skips damaged lines and a half-written last one.
     """
     return [entry for entry in _entries(pathlib.Path(path)) if entry is not None]
 
 
 def truncate(path: str | os.PathLike[str], env_steps: int) -> int:
-    """Drops the lines later than `env_steps`, a half-written one, and those that are damaged.
+    """Drops the lines later than `env_steps`, and damaged or half-written ones.
 
     Returns:
-      How many were damaged among those that stay.
+      The number of damaged lines before the last line that is kept.
     """
     path = pathlib.Path(path)
     if not path.exists():
@@ -169,7 +168,7 @@ def truncate(path: str | os.PathLike[str], env_steps: int) -> int:
 
 
 def _entries(path: pathlib.Path) -> list[Line | None]:
-    """What each line says; None for what no run has written whole."""
+    """The entry of each line; None for damaged and half-written lines."""
     try:
         text = path.read_text(errors="replace")
     except FileNotFoundError:
@@ -187,10 +186,9 @@ def _entry(text: str) -> Line | None:
 
 
 class Board:
-    """TensorBoard's event file, written at once and here.
+    """TensorBoard's event file, written without a thread.
 
-    tensorboardX's own writer hands events to a thread, where a full disk ends the thread
-    and not the run.
+    tensorboardX's writer uses a thread; a full disk would end that thread and not the run.
     """
 
     def __init__(self, logdir: pathlib.Path, *, purge_after: int | None = None):
@@ -202,7 +200,7 @@ class Board:
             self._add(Event(step=purge_after + 1, session_log=start))
 
     def write(self, entry: Line) -> None:
-        """Adds what is a number in one line of metrics."""
+        """Adds the finite numbers of one line of metrics."""
         values = [Summary.Value(tag=k, simple_value=v) for k, v in finite(entry).items()]
         self._add(Event(step=entry["env_steps"], summary=Summary(value=values)))
         self._file.flush()
@@ -210,7 +208,7 @@ class Board:
     def write_video(self, name: str, gif: pathlib.Path, env_steps: int) -> None:
         """Adds an animated GIF in colour, which TensorBoard plays."""
         data = gif.read_bytes()
-        width, height = struct.unpack("<HH", data[6:10])  # as the format begins
+        width, height = struct.unpack("<HH", data[6:10])  # from the GIF header
         image = Summary.Image(
             height=height, width=width, colorspace=3, encoded_image_string=data
         )
@@ -232,14 +230,13 @@ class Tracker:
 
     Args:
       logdir: the folder of the run.
-      purge_after: the last env step that TensorBoard keeps of what was written before;
-        None keeps all.
-      further: backends that see to their own failures, as
-        `vawm.runs.reports.backends.connect` makes them.
+      purge_after: TensorBoard drops earlier events after this env step; None keeps all.
+      further: backends that handle their own failures, from
+        `vawm.runs.reports.backends.connect`.
       say: prints a warning.
 
     Raises:
-      OSError: `metrics.jsonl` or a video cannot be written, here and in every method.
+      OSError: `metrics.jsonl` or a video cannot be written; every method raises it.
     """
 
     def __init__(
@@ -259,7 +256,7 @@ class Tracker:
             self._drop_board(error)
 
     def write(self, entry: Line) -> None:
-        """Appends one line; it is in the files when this returns."""
+        """Appends one line and flushes the files."""
         self._file.write(as_json(entry) + "\n")
         self._file.flush()
         self._to_board(lambda board: board.write(entry))
@@ -267,7 +264,7 @@ class Tracker:
             backend.write(entry)
 
     def write_videos(self, videos: Sequence[Video], *, env_steps: int) -> None:
-        """Writes each as `videos/<name>-<env steps>.gif`, its numbers into `videos.jsonl`."""
+        """Writes each as `videos/<name>-<env steps>.gif`, its numbers to `videos.jsonl`."""
         folder = self._logdir / VIDEOS
         for video in videos:
             folder.mkdir(exist_ok=True)
@@ -287,8 +284,10 @@ class Tracker:
                 file.write(as_json(entry) + "\n")
 
     def show_videos(self, *, after: int) -> None:
-        """Gives TensorBoard the videos of a resumed run again that it dropped: those later
-        than the last line of metrics."""
+        """Sends TensorBoard the videos that it dropped at a resume, those later than `after`.
+
+        `after` is the env step of the last line of metrics.
+        """
         path = self._logdir / VIDEO_LINES
         for entry in read(path):
             video = self._logdir / VIDEOS / entry["video"]
@@ -306,13 +305,13 @@ class Tracker:
                 self._drop_board(error)
 
     def _drop_board(self, error: Exception) -> None:
-        """The run goes on without TensorBoard, unless the disk is full."""
+        """Continues without TensorBoard, unless the disk is full."""
         if isinstance(error, OSError) and error.errno in FULL:
             raise error
         self._board = None
         reason = (str(error).strip() or repr(error)).splitlines()[0][:200]
         self._say(
-            f"warning: TensorBoard gets no more of this run ({reason}); {METRICS} has all"
+            f"warning: stopped reporting to TensorBoard ({reason}); {METRICS} is complete"
         )
 
     def __enter__(self) -> Tracker:

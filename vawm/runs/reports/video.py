@@ -1,7 +1,7 @@
-"""Videos from replayed images: what the world model expects, and what the policy does.
+"""Videos from replayed images: predictions of the world model, and episodes of the policy.
 
-Both are read from replay, so that a run remembers nothing for their sake, and no random
-number of the run is used.
+Both are read from replay, so they need no extra memory, and they use none of the run's random
+numbers.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from vawm.config import Config
 from vawm.learning import image_store, replay
 from vawm.learning.replay import Positions
 from vawm.learning.train import TrainState
-from vawm.runs.trainer import Program
+from vawm.runs.trainer import Trainer
 from vawm.types import Batch, PyTree, is_image
 
 FRAMES_PER_SECOND = 20
@@ -28,12 +28,12 @@ SEEN, IMAGINED = (0, 160, 0), (200, 0, 0)  # colours of the border
 
 
 class Video(NamedTuple):
-    """Frames and what they show in numbers.
+    """A video and its numbers.
 
     Attributes:
-      name: what it is, such as "open_loop".
+      name: kind of video, such as "open_loop".
       frames: `[T, H, W, 3]` uint8.
-      numbers: to be noted beside it, ready for JSON.
+      numbers: written next to it, ready for JSON.
     """
 
     name: str
@@ -41,16 +41,16 @@ class Video(NamedTuple):
     numbers: dict[str, Any]
 
 
-def make(program: Program, config: Config) -> Callable[[TrainState], list[Video]] | None:
-    """Build `film(state) -> videos`; None where the config wants none.
+def make(trainer: Trainer, config: Config) -> Callable[[TrainState], list[Video]] | None:
+    """Builds `film(state) -> videos`; None if the config asks for no videos.
 
-    A video that replay has no material for yet is left out.
+    `film` leaves out a video if replay does not have enough steps for it yet.
     """
     if not config.video.every:
         return None
     choices = config.video
     on_host = config.replay.images == "host"
-    predict = jax.jit(make_open_loop(program.agent, context=choices.context))
+    predict = jax.jit(make_open_loop(trainer.agent, context=choices.context))
     look_up = jax.jit(lambda buffer, at: replay.read(buffer, at))
 
     def look(state: TrainState, positions: Positions) -> Batch:
@@ -84,7 +84,7 @@ def make(program: Program, config: Config) -> Callable[[TrainState], list[Video]
         )
         if times is not None:
             shown = times[: choices.episode_steps]
-            # One length for all, so that it is compiled once.
+            # A constant length, so that it is compiled once.
             padded = np.resize(shown, choices.episode_steps).astype(np.int32)
             batch = look(state, Positions(np.zeros(1, np.int32), padded[None]))
             frames = side_by_side(jax.device_get(batch.trajectory.obs))[0, : len(shown)]
@@ -101,10 +101,10 @@ def open_loop_video(
 ) -> Video:
     """Truth, prediction and their difference, one above the other; sequences side by side.
 
-    The border is green while the world model sees, red while it imagines. The difference is
-    grey where there is none. `numbers` has the mean squared error of a pixel in [0, 1], over
-    all channels, for each step and the sequences that no reset has cut; None where it has cut
-    all, or where a prediction is not finite.
+    The border is green while the world model observes, red while it imagines. Zero
+    difference is grey. `numbers` has, for each step, the mean squared error of pixels in
+    [0, 1] over all channels and over the sequences without a reset so far; None if all had a
+    reset or a prediction is not finite.
     """
     error = squared_error(truth, predicted)
     kept = [error[same_episode[:, t], t] for t in range(error.shape[1])]
@@ -123,13 +123,13 @@ def open_loop_video(
 
 
 def mean_or_none(values: np.ndarray) -> float | None:
-    """The mean as JSON can hold it."""
+    """The mean, or None if it is not finite, as JSON requires."""
     mean = float(values.mean()) if values.size else np.nan
     return mean if np.isfinite(mean) else None
 
 
 def squared_error(truth: PyTree, predicted: PyTree) -> np.ndarray:
-    """Mean over all pixels and channels of the images, `[B, T]`, as they were predicted."""
+    """Squared error of the predicted images `[B, T]`, mean over pixels and channels."""
     errors = [
         np.square(np.asarray(guess, np.float64) - pixels / 255.0)
         for pixels, guess in zip(
@@ -142,14 +142,14 @@ def squared_error(truth: PyTree, predicted: PyTree) -> np.ndarray:
 
 
 def to_bytes(predicted: np.ndarray, like: np.ndarray) -> np.ndarray:
-    """Images in [0, 1] as bytes, what is not finite black; vectors are left alone."""
+    """Images in [0, 1] as uint8; values that are not finite become black. Keeps vectors."""
     if not is_image(like):
         return like
     return np.round(255 * np.clip(np.nan_to_num(predicted), 0, 1)).astype(np.uint8)
 
 
 def framed(images: np.ndarray, color: tuple[int, int, int]) -> np.ndarray:
-    """`[B, H, W, 3]` with a border of `color` in the place of the outermost pixels."""
+    """Replaces the outermost pixels of `[B, H, W, 3]` by a border of `color`."""
     images = images.copy()
     edges = slice(BORDER), slice(-BORDER, None)
     for edge in edges:
@@ -159,9 +159,9 @@ def framed(images: np.ndarray, color: tuple[int, int, int]) -> np.ndarray:
 
 
 def side_by_side(obs: PyTree) -> np.ndarray:
-    """The images of `[B, T, ...]` observations as one, `[B, T, H, W, 3]` uint8.
+    """Joins the images of `[B, T, ...]` observations to `[B, T, H, W, 3]` uint8.
 
-    Of more than three channels the first three are shown, of fewer the first as grey.
+    Shows the first three channels, or the first one in grey if there are fewer than three.
     """
     images = [np.asarray(x) for x in jax.tree.leaves(obs) if is_image(x)]
     colored = [
@@ -173,13 +173,13 @@ def side_by_side(obs: PyTree) -> np.ndarray:
 def last_episode(
     is_first: np.ndarray, is_last: np.ndarray, *, head: int, size: int
 ) -> np.ndarray | None:
-    """Where the newest whole episode of one stream lies, oldest step first; or None.
+    """Indices of the newest complete episode of one stream, oldest step first; or None.
 
     Args:
       is_first: `[C]` flags of one stream of replay.
       is_last: `[C]`.
-      head: where the next step will be written.
-      size: steps held.
+      head: index at which the next step will be written.
+      size: number of steps stored.
     """
     times = (head - size + np.arange(size)) % len(is_first)
     starts, ends = (np.flatnonzero(flags[times]) for flags in (is_first, is_last))
@@ -191,7 +191,7 @@ def last_episode(
 
 
 def as_gif(frames: np.ndarray) -> bytes:
-    """An animated GIF of `[T, H, W, 3]` frames that repeats for ever."""
+    """An animated GIF of `[T, H, W, 3]` frames that loops forever."""
     first, *rest = (Image.fromarray(frame) for frame in frames)
     file = io.BytesIO()
     first.save(
