@@ -167,6 +167,15 @@ def saved(agent):
     return dataclasses.asdict(tiny.CONFIG) | {"agent": agent}
 
 
+def test_what_other_programs_need_to_know_an_agent(register, monkeypatch):
+    register("mine", MineConfig, rssm)
+    monkeypatch.chdir(pathlib.Path(__file__).parent)
+    assert registry.plugin_of("mine") == "test_registry.py"
+    monkeypatch.chdir(pathlib.Path(__file__).parents[1] / "runs")
+    assert registry.plugin_of("mine") == __file__
+    assert registry.plugin_of("storm") is None
+
+
 def test_heads_of_dreamerv3_need_no_more_than_their_config():
     assert {field.name for field in dataclasses.fields(HeadsConfig)} <= {
         field.name for field in dataclasses.fields(RSSMConfig)

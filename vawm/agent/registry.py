@@ -15,6 +15,7 @@ modules that `--plugin` or the environment variable `VAWM_PLUGINS` names, `vawm.
 from __future__ import annotations
 
 import dataclasses
+import pathlib
 import re
 import sys
 import typing
@@ -201,6 +202,22 @@ def kind(name: str) -> AgentKind:
     if name not in names():
         raise UnknownAgent(name)
     return _ROWS[name]
+
+
+def plugin_of(name: str) -> str | None:
+    """The file that other programs need as `--plugin`; None for our own agents.
+
+    Relative to the working directory if it is below; the module's name where there is no file.
+    """
+    cls = kind(name).world_model
+    if cls.__module__.split(".")[0] == "vawm":
+        return None
+    path = pathlib.Path(_origin(cls)[0])
+    return str(
+        path.relative_to(pathlib.Path.cwd())
+        if path.is_relative_to(pathlib.Path.cwd())
+        else path
+    )
 
 
 def presets_of(config: Config) -> Mapping[str, Config]:

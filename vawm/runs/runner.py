@@ -12,6 +12,7 @@ import errno
 import functools
 import pathlib
 import shlex
+import sys
 import time
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, NoReturn
@@ -19,6 +20,7 @@ from typing import Any, NamedTuple, NoReturn
 import jax
 import rich.console
 
+from vawm.agent import registry
 from vawm.config import Config
 from vawm.envs.protocol import Environment, EnvironmentFailure, HostEnvironment
 from vawm.errors import InvalidInput
@@ -425,8 +427,14 @@ def _summarise(
         f"episode return: {shown}",
         f"metrics, TensorBoard events and {saved}: {result.logdir}",
     ]
-    evaluation = f"python -m vawm.evaluate --logdir {shlex.quote(str(result.logdir))}"
-    resumption = f"{command} --resume --logdir {shlex.quote(str(result.logdir))}"
+    where = f"--logdir {shlex.quote(str(result.logdir))}"
+    evaluation, resumption = f"python -m vawm.evaluate {where}", f"{command} --resume {where}"
+    if plugin := registry.plugin_of(config.agent):
+        words = f" --plugin {shlex.quote(plugin)}"
+        evaluation += words
+        resumption += (
+            "" if pathlib.Path(sys.argv[0]).name == pathlib.Path(plugin).name else words
+        )
     longer = f" --env-steps {2 * config.env_steps}"
     if not known_task:  # there is no command line for the user's environment
         folder = repr(str(result.logdir))
