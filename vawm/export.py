@@ -23,7 +23,7 @@ import sys
 from collections.abc import Sequence
 
 from vawm import evaluate
-from vawm.agent import parameter_count
+from vawm.agent import parameter_count, registry
 from vawm.cli import flags
 from vawm.cli.command_line import guard
 from vawm.config import Config
@@ -120,9 +120,12 @@ def _last_return(logdir: pathlib.Path, env_steps: int) -> str:
 def card(policy: Policy, measured: str) -> str:
     """The text of `README.md`; `measured` is the sentence about the policy's score."""
     config, spec = policy.config, policy.spec
+    plugin = registry.plugin_of(config.agent)
+    file = pathlib.Path(plugin).name if plugin else ""
+    evaluation = "python -m vawm.evaluate --logdir FOLDER" + (file and f" --plugin {file}")
     rows = {
         "task": f"{spec.task} ({config.suite})",
-        "agent": config.agent,
+        "agent": config.agent + (f", registered by {file}: import it first" if file else ""),
         "size": f"{config.size}, {parameter_count(policy.params):,} parameters",
         "preset": config.preset,
         "env steps": f"{policy.env_steps:,} of {config.env_steps:,}, "
@@ -154,7 +157,7 @@ tags: [reinforcement-learning, world-model, jax]
 {_usage(policy)}
 ```
 
-Evaluate it with `python -m vawm.evaluate --logdir FOLDER`. `{weights.CONFIG}` has all training
+Evaluate it with `{evaluation}`. `{weights.CONFIG}` has all training
 settings.
 
 ## Licence
