@@ -122,7 +122,9 @@ def card(policy: Policy, measured: str) -> str:
     config, spec = policy.config, policy.spec
     plugin = registry.plugin_of(config.agent)
     file = pathlib.Path(plugin).name if plugin else ""
-    evaluation = "python -m vawm.evaluate --logdir FOLDER" + (file and f" --plugin {file}")
+    evaluation = "python -m vawm.evaluate --logdir FOLDER"
+    if file:
+        evaluation += f" --plugin {file}"
     rows = {
         "task": f"{spec.task} ({config.suite})",
         "agent": config.agent + (f", registered by {file}: import it first" if file else ""),
