@@ -1,12 +1,12 @@
-"""Value alignment in somebody else's world model: 40 lines of code, model and data included.
+"""Value alignment in another world model: 40 lines of code, including model and data.
 
     python experiments/align_your_model.py
 
-The model is recurrent, in plain JAX, with a categorical latent: h_t comes from what was before,
-z_t from h_t and what is seen, or from h_t alone where it is predicted. It learns where a point
-is that is pushed along a line and slips. The critic is anybody's; here it is a layer of random
-weights. For each seed the model is trained twice from the same start, on the same data: with a
-warm-up of value alignment that never ends, and with one that does. Printed is the KL between
+The model is recurrent, in plain JAX, with a categorical latent: h_t depends on the past, z_t on
+h_t and the observation (posterior) or on h_t alone (prior). It learns the position of a point
+that is pushed along a line and slips. Any critic works; here it is a layer of random weights.
+For each seed, the model is trained twice from the same start and on the same data: with a
+warm-up of value alignment that never ends, and with one that does. Prints the KL between the
 values under posterior and prior: in the first step, and the mean over the last 50.
 """
 
@@ -16,22 +16,22 @@ import jax.numpy as jnp
 from vawm.losses import balanced_kl, value_alignment_loss, value_alignment_weight
 
 BATCH, LENGTH, STEPS, WARMUP = 32, 16, 500, 100
-# What each layer gives, from what: h is 32 wide, z has 8 classes, the critic 21 bins.
+# Inputs and outputs of each layer: h has 32 numbers, z 8 classes, the critic 21 bins.
 SIZES = {"h": (41, 32), "post": (33, 8), "prior": (32, 8), "obs": (40, 1), "value": (40, 21)}
 
 
 def sample(key, logits):
-    """One-hot, with the gradient of the probabilities."""
+    """A one-hot sample with the gradient of the probabilities (straight-through)."""
     probs = jax.nn.softmax(logits)
     one_hot = jax.nn.one_hot(jax.random.categorical(key, logits), logits.shape[-1])
     return one_hot + probs - jax.lax.stop_gradient(probs)
 
 
 def loss(params, keys, step, warmup_steps):
-    """The model's own loss with L_var added, and the value KL."""
+    """The loss of the model plus L_var, and the value KL."""
     push, slip = jax.random.normal(keys[0, 0], (2, LENGTH, BATCH, 1))
     obs = 0.4 * jnp.cumsum(push + slip, axis=0)
-    critic = 5.0 * jax.lax.stop_gradient(params["value"])  # or it would learn not to care
+    critic = 5.0 * jax.lax.stop_gradient(params["value"])  # or it would learn to ignore z
 
     def cell(latent, inputs):
         push, obs, (key_post, key_prior) = inputs
@@ -44,7 +44,7 @@ def loss(params, keys, step, warmup_steps):
         aligned = value_alignment_loss(*values, dynamics_scale=0.5, representation_scale=0.1)
         weight = value_alignment_weight(kl, step, warmup_steps=warmup_steps)
         total = error + kl + 0.1 * kl_post + weight * aligned
-        # Both terms of L_var have the value of the KL; they differ in their gradients.
+        # Both terms of L_var equal the KL in value; they differ in their gradients.
         return (h, z), (total, aligned / 0.6)
 
     start = jnp.zeros((BATCH, 32)), jnp.zeros((BATCH, 8))
@@ -54,7 +54,7 @@ def loss(params, keys, step, warmup_steps):
 
 @jax.jit
 def train(seed, warmup_steps):
-    """`[STEPS]` value KL, each of new data, along as many gradient steps."""
+    """Value KL `[STEPS]` over gradient steps, each on new data."""
 
     def update(params, inputs):
         slope, value_kl = jax.grad(loss, has_aux=True)(params, *inputs, warmup_steps)

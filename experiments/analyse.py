@@ -1,4 +1,4 @@
-"""What value alignment does, seen in trained runs, as PNG, MP4, CSV and JSON.
+"""Analyses what value alignment does in trained runs; writes PNG, MP4, CSV and JSON.
 
     python experiments/analyse.py --logdirs runs/aligned runs/plain
     python experiments/analyse.py --logdirs runs/aligned --what values --episodes 20 --depth 15
@@ -6,14 +6,13 @@
 
     trajectories   imagination against the truth, Figs 3 and 7
     saliency       what decoder and value depend on, Figs 3 and 13
-    values         value errors by depth of imagination, and true returns
+    values         value errors by depth of imagination, and actual returns
     curves         losses and the weight of value alignment in training, Figs 8, 9 and 12
 
-Plays whole episodes of every run in its own environments; all but `curves` is read from these.
-With `--player` one run plays, and all are judged on its episodes, wherever their own policies
-would have gone. Runs that differ in nothing but their seed are one group, whose mean value
-errors have standard errors over runs. Works for every agent, from vectors and from pixels.
-Needs the extra `analysis`.
+Plays whole episodes of every run in its own environments; everything but `curves` uses these.
+With `--player` one run plays, and all runs are judged on its episodes. Runs that differ only in
+their seed are one group: its mean value errors have standard errors over runs. Works for every
+agent, from vectors and from pixels. Needs the extra `analysis`.
 """
 
 from __future__ import annotations
@@ -53,30 +52,30 @@ FRAMES_PER_SECOND = 5  # slow enough to compare
 
 @dataclass(frozen=True)
 class Options:
-    """Which runs, what of them, and where it goes."""
+    """The runs to analyse, the analyses, and the folder of the results."""
 
     logdirs: tuple[pathlib.Path, ...]
     """folders of runs"""
     what: Literal["all", "trajectories", "saliency", "values", "curves"] = "all"
     output: pathlib.Path = pathlib.Path("analysis")
-    """folder of the results; files of the same name are written over"""
+    """folder of the results; existing files are overwritten"""
     episodes: int = 5
     """whole episodes of every run"""
     depth: int = 20
     """steps of imagination"""
     context: int = 8
-    """steps that are seen before; a transformer infers every state from so many"""
+    """observed steps before imagination; a transformer infers every state from this many"""
     frames: int = 6
-    """states of which there are saliency maps"""
+    """states with saliency maps"""
     every: int = 0
-    """steps from column to column of a strip; 0 for as many columns as fit"""
+    """steps between columns of a strip; 0 for as many columns as fit"""
     unit: Literal["symlog", "raw"] = "symlog"
-    """of the value that saliency differentiates"""
+    """unit of the value in saliency"""
     how: Literal["sample", "mode"] = "sample"
     """sample actions from the policy, or take its mode"""
     player: pathlib.Path | None = None
-    """folder of the run that plays the episodes on which all are judged; by default each run
-    plays its own"""
+    """folder of the run whose episodes all runs are judged on; by default each run plays its
+    own"""
     seed: int = 0
 
     def wants(self, what: str) -> bool:
@@ -84,7 +83,7 @@ class Options:
 
 
 class Loaded(NamedTuple):
-    """Runs by name, and who plays for all; policies only where they are needed."""
+    """Runs by name, and the policy that plays for all; policies only if they are needed."""
 
     policies: dict[str, Policy]
     runs: dict[str, curves.Run]
@@ -92,7 +91,7 @@ class Loaded(NamedTuple):
 
 
 class Played(NamedTuple):
-    """A run, and the episodes on which it is judged."""
+    """A run, and the episodes that it is judged on."""
 
     name: str
     policy: Policy
@@ -104,28 +103,28 @@ class Played(NamedTuple):
 
 
 def names(logdirs: Sequence[pathlib.Path]) -> list[str]:
-    """The last parts of each path, as few as tell them apart."""
+    """Names of the runs: the last parts of each path, as few as make them unique."""
     parts = [path.expanduser().absolute().parts for path in logdirs]
     for count in range(1, max(map(len, parts)) + 1):
         found = ["-".join(own[-count:]).replace("/", "") for own in parts]
         if len(set(found)) == len(found):
             return found
-    raise InvalidInput("logdirs", [str(path) for path in logdirs], "name each run once")
+    raise InvalidInput("logdirs", [str(path) for path in logdirs], "give each run once")
 
 
 def prepare(options: Options) -> Loaded:
-    """Refuses what cannot be done, and reads the runs.
+    """Checks the options and reads the runs.
 
     Raises:
       InvalidInput: names the option, its value and the remedy.
-      RunError: a package is missing.
+      RunError: a package is not installed.
     """
     evaluate.check(options.episodes, options.seed)
     check_positive("frames", options.frames)
     if options.every < 0:
         raise InvalidInput("every", options.every, "use 0 or a number above")
     if not options.logdirs:
-        raise InvalidInput("logdirs", (), "name the folder of at least one run")
+        raise InvalidInput("logdirs", (), "give the folder of at least one run")
     called = dict(zip(names(options.logdirs), options.logdirs, strict=True))
     run_folder.check_writable(options.output, "output")
     figures.check()
@@ -143,7 +142,7 @@ def prepare(options: Options) -> Loaded:
 
 
 def check(options: Options, name: str, policy: Policy, player: Policy | None) -> None:
-    """Refuses a run of which what is wanted cannot be shown."""
+    """Refuses a run that the options cannot be applied to."""
     if player is not None:
         episodes.check_can_watch(name, policy.spec, player.spec)
     inference.check(policy.config, context=options.context, depth=options.depth)
@@ -203,7 +202,7 @@ def show_saliency(options: Options, played: Sequence[Played]) -> None:
 
 
 def show_values(options: Options, played: Sequence[Played]) -> None:
-    """Prints a table of what it found, and which groups are uneven."""
+    """Writes and prints the value errors, and names groups of unequal length."""
     reports = {
         name: values.report(
             policy, record, context=options.context, depth=options.depth, seed=options.seed
@@ -226,9 +225,9 @@ def show_values(options: Options, played: Sequence[Played]) -> None:
 
 
 def uneven(groups: Mapping[str, Sequence[Played]]) -> list[str]:
-    """Names the groups whose runs were trained for different lengths.
+    """Names the groups with runs of different length.
 
-    A run may exceed its steps by a few, so a hundredth more or less is no difference.
+    A run may exceed its env steps by a few, so differences up to 1 % are ignored.
     """
     lines = []
     for group, runs in groups.items():
@@ -242,7 +241,7 @@ def uneven(groups: Mapping[str, Sequence[Played]]) -> list[str]:
 def play(options: Options, loaded: Loaded) -> list[Played]:
     """Records the episodes of every run, or of the one that plays for all.
 
-    Writes what they earned to `summary.json`.
+    Writes their returns to `summary.json`.
     """
 
     def record(name: str, policy: Policy) -> Episodes:
@@ -258,7 +257,7 @@ def play(options: Options, loaded: Loaded) -> list[Played]:
             for name, policy in loaded.policies.items()
         ]
     else:
-        shared = record(f"{options.player}, which plays for all", loaded.player)
+        shared = record(f"{options.player} (plays for all runs)", loaded.player)
         played = [
             Played(name, policy, episodes.watched_by(policy, shared, seed=options.seed))
             for name, policy in loaded.policies.items()
@@ -268,7 +267,7 @@ def play(options: Options, loaded: Loaded) -> list[Played]:
 
 
 def summary(options: Options, played: Sequence[Played]) -> dict[str, dict[str, Any]]:
-    """Of each run: its group, and the episodes on which it is judged."""
+    """For each run: its group, and the episodes that it is judged on."""
     return {
         run.name: {
             "group": group,
@@ -284,7 +283,7 @@ def summary(options: Options, played: Sequence[Played]) -> dict[str, dict[str, A
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Analyses; returns the exit code."""
+    """Analyses the runs; returns the exit code."""
     options = flags.read(Options, argv, description=__doc__)
     loaded = prepare(options)
     options.output.mkdir(parents=True, exist_ok=True)

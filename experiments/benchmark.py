@@ -1,13 +1,13 @@
-"""How fast is one update? A synthetic batch, value alignment on and off in turn.
+"""Measures the speed of an update, on a synthetic batch, with and without value alignment.
 
     python experiments/benchmark.py --size 1m --json
     python experiments/benchmark.py --size 1m --obs pixels --json
     python experiments/benchmark.py --agent storm --obs pixels --json
 
-Prints medians over repeated runs after a warm-up; absolute times depend on the machine,
-ratios within one run are to be trusted. "off" drops value alignment from the compiled
-program altogether, its metrics included, so it is plain DreamerV3, or plain STORM. From pixels,
-collection is timed with environments that dm_control renders in 1 to 4 processes.
+Prints medians over repeated updates after a warm-up. Absolute times depend on the machine; only
+ratios within one run are reliable. "off" removes value alignment and its metrics from the
+compiled function, which leaves plain DreamerV3 or plain STORM. From pixels, collection is timed
+with environments that dm_control renders in 1 to 4 processes.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class Benchmark:
     agent: AgentName = "dreamerv3"
     """storm: Table 14, imagination from 1024 separate contexts"""
     size: str | None = None
-    """model size; 16m for storm, 1m for the others if not given"""
+    """model size; default 16m for storm, the smallest for other agents"""
     batch_size: int = 16
     batch_length: int = 64
     obs: Literal["vector", "pixels"] = "vector"
@@ -82,11 +82,11 @@ class Benchmark:
     fast_rendering: bool = False
     """without shadows, reflections and anti-aliasing"""
     json: bool = False
-    """print one JSON object and nothing else"""
+    """print only one JSON object"""
 
 
 def check(options: Benchmark) -> None:
-    """Refuses what cannot be measured, before anything is compiled."""
+    """Refuses impossible options, before anything is compiled."""
     validate.check_choice("agent", options.agent, registry.names())
     validate.check_choice("size", size_of(options), [*sizes_of(options), CUSTOM])
     registry.kind(options.agent).check(make_config(options))
@@ -105,14 +105,14 @@ def sizes_of(options: Benchmark) -> Sequence[str]:
 
 
 def size_of(options: Benchmark) -> str:
-    """The size asked for; 16m for storm, else the smallest there is."""
+    """The size in the options; default 16m for storm, the smallest for other agents."""
     if options.size is not None:
         return options.size
     return "16m" if options.agent == "storm" else next(iter(sizes_of(options)), CUSTOM)
 
 
 def paper_of(agent: str) -> Config:
-    """The paper's preset of an agent, of the proprio tasks where there is one."""
+    """The paper's preset of an agent, for the proprio tasks if there is one."""
     of_suites = registry.kind(agent).presets.values()
     return next(named["paper"] for named in of_suites if "paper" in named)
 
@@ -134,7 +134,7 @@ def make_config(options: Benchmark) -> Config:
 
 
 def synthetic_batch(options: Benchmark, shape: tuple[int, int], context, seed: int) -> Batch:
-    """Experience of `shape` sequences and steps."""
+    """Random experience of `shape` (sequences, steps)."""
     key_obs, key_action, key_reward = jax.random.split(jax.random.key(seed), 3)
     flags = jnp.zeros(shape, bool)
     spec = make_spec(options)
@@ -157,7 +157,7 @@ def synthetic_batch(options: Benchmark, shape: tuple[int, int], context, seed: i
 
 
 def make_spec(options: Benchmark) -> EnvSpec:
-    """What a synthetic batch is from."""
+    """The environment spec of a synthetic batch."""
     if options.obs == "pixels":
         return EnvSpec("synthetic", image(options.image_size), 18, True, 1, 1, None)
     obs = vector(options.observations)
@@ -165,7 +165,7 @@ def make_spec(options: Benchmark) -> EnvSpec:
 
 
 class TimedUpdate:
-    """One compiled variant of the update and the learner that it advances."""
+    """One compiled variant of the update, with its learner."""
 
     def __init__(self, agent, config: Config, batch: Draw, aligned: bool):
         update = make_update(agent, config)
@@ -194,7 +194,7 @@ class TimedUpdate:
 
 
 def product_gflop_per_s(side: int = 2048, repeats: int = 9) -> float:
-    """What this machine gives to a product of large float32 matrices: a measure of the rest."""
+    """Speed of a product of large float32 matrices, as a reference for this machine."""
     matrix = jax.random.normal(jax.random.key(0), (side, side))
     product = jax.jit(jnp.matmul)
     seconds = []
@@ -206,7 +206,7 @@ def product_gflop_per_s(side: int = 2048, repeats: int = 9) -> float:
 
 
 def env_steps_per_s(options: Benchmark, config: Config) -> float:
-    """Control steps a second of collection: acting, physics and storing, no learning."""
+    """Control steps per second of collection: acting, physics and storing, no learning."""
     env = envs.make(options.task, num_envs=options.num_envs, action_repeat=1)
     agent = make_agent(config, env.spec)
     state = train.init(env, agent, config, jax.random.key(0))
@@ -220,7 +220,7 @@ def env_steps_per_s(options: Benchmark, config: Config) -> float:
 
 
 def frames_per_s(options: Benchmark, config: Config) -> dict[str, float]:
-    """Rendered steps a second of all environments together, acted on, by worker processes."""
+    """Rendered steps per second of all environments, with acting, by number of workers."""
     choices = VisionConfig(image_size=options.image_size, fast_rendering=options.fast_rendering)
     config = dataclasses.replace(config, suite="dmc_vision", task=options.task)
     act, measured = None, {}
@@ -243,7 +243,7 @@ def frames_per_s(options: Benchmark, config: Config) -> dict[str, float]:
 
 
 def check_memory(agent, config: Config) -> None:
-    """Refuses what does not fit: two learners, and the larger part of one update."""
+    """Refuses sizes that do not fit into memory: two learners, and most of one update."""
     init = functools.partial(init_learner, agent, config)
     learner = jax.eval_shape(init, jax.random.key(0))
     state, params = budget.nbytes(learner), budget.nbytes(learner.params)
@@ -253,7 +253,7 @@ def check_memory(agent, config: Config) -> None:
     available = budget.available_bytes()
     if available is not None and needed > available:
         remedy = (
-            f"needs {budget.readable(needed)}, {budget.readable(available)} are free; "
+            f"needs {budget.readable(needed)}, but {budget.readable(available)} are free; "
             "use a smaller size or batch"
         )
         raise InvalidInput("size", config.size, remedy)
@@ -317,10 +317,10 @@ def run(options: Benchmark) -> dict:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Prints what was measured; returns the exit code."""
+    """Prints the measurements; returns the exit code."""
     options = flags.read(Benchmark, argv, description=__doc__)
     check(options)
-    jax.config.update("jax_enable_compilation_cache", False)  # compile_s is a cold figure
+    jax.config.update("jax_enable_compilation_cache", False)  # compile_s is without a cache
     result = run(options)
     if options.json:
         print(json.dumps(result))

@@ -1,10 +1,10 @@
-"""Where the gradient of value alignment goes, and what its noise does, before any training.
+"""Measures the gradient of value alignment, and the effect of its noise, before training.
 
     python experiments/gradient_routes.py
 
-prints the two tables at the end of `docs/paper.md`: of STORM's `paper` preset at its initial
-parameters, on random pixels and actions, each number from the lowest to the highest of the
-seeds. The last column of the first is of a critic whose parameters were not stopped.
+Prints the two tables at the end of `docs/paper.md`, for STORM's `paper` preset at its initial
+parameters, on random pixels and actions. Each cell is the range over seeds. The last column of
+the first table is the gradient of a critic without stopped parameters.
 """
 
 from __future__ import annotations
@@ -48,17 +48,17 @@ FACTORS = 1, 2, 4, 16
 
 @dataclass(frozen=True)
 class Options:
-    """How much is measured."""
+    """The size of the measurement."""
 
     seeds: int = 3
     batch_size: int = 2
     batch_length: int = 16
     states: int = 4096
-    """of which values are compared"""
+    """states to compare values of"""
 
 
 def random_batch(spec: EnvSpec, key: Key, shape: tuple[int, int]) -> Batch:
-    """Pixels and actions without meaning."""
+    """A batch of random pixels and actions."""
     key_obs, key_action = jax.random.split(key)
     chosen = jax.random.randint(key_action, shape, 0, spec.action_size)
     never = jnp.zeros(shape, bool)
@@ -74,7 +74,7 @@ def random_batch(spec: EnvSpec, key: Key, shape: tuple[int, int]) -> Batch:
 
 
 def routes(agent: Agent, config: Config, options: Options) -> dict[str, list[list[float]]]:
-    """Term -> per part of the world model and the critic, the norm of its gradient, by seed."""
+    """Term -> gradient norm of each part of the world model and of the critic, by seed."""
 
     def norms(seed: Array, alignment: ValueAlignmentConfig) -> list[Array]:
         key_init, key_batch, key_explain = jax.random.split(jax.random.key(seed), 3)
@@ -123,8 +123,10 @@ def routes(agent: Agent, config: Config, options: Options) -> dict[str, list[lis
 
 
 def noise(agent: Agent, config: Config, options: Options) -> dict[str, list[list[float]]]:
-    """Kind of noise -> per factor the KL of values, by seed, where prior logits are the factor
-    times those of the posterior."""
+    """Kind of noise -> KL of values for each factor, by seed.
+
+    The prior logits are the factor times the posterior logits.
+    """
     model = config.world_model
 
     @jax.jit
@@ -154,7 +156,7 @@ def noise(agent: Agent, config: Config, options: Options) -> dict[str, list[list
 
 
 def table(head: Sequence[str], rows: dict[str, list[list[float]]]) -> str:
-    """In Markdown; of every cell the lowest and the highest."""
+    """A table in Markdown; every cell has the lowest and the highest number."""
     lines = [line(head), line(["---"] * len(head))]
     for name, cells in rows.items():
         ends = ([f"{end(cell):.2g}" for end in (min, max)] for cell in cells)

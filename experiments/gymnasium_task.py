@@ -2,10 +2,10 @@
 
     python experiments/gymnasium_task.py --task CartPole-v1
 
-The environment is checked first; all that does not fit is told at once. One that is not
-registered is trained by
-`vawm.runs.runner.run(config, logdir, env=vawm.envs.from_gymnasium(...))`. Every field of
-`vawm.config.Config` is a flag, those of `GymnasiumConfig` as `--env.*`; `--help` lists them.
+Checks the environment first and lists all problems at once. To train in an environment that is
+not registered, call `vawm.runs.runner.run(config, logdir, env=vawm.envs.from_gymnasium(...))`.
+Every field of `vawm.config.Config` is a flag, those of `GymnasiumConfig` as `--env.*`; `--help`
+lists them.
 """
 
 from __future__ import annotations

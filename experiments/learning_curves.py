@@ -4,11 +4,11 @@
     python experiments/learning_curves.py --experiment gymnasium_task --preset pixels
     python experiments/learning_curves.py --agent storm --tasks cartpole_balance
 
-Runs what is missing under `--runs`, `--jobs` at a time (on Linux each on cores of its own),
-and writes `curves_<experiment>.csv` and `.png` to `--results`, of another agent than dreamerv3
-`curves_<experiment>_<agent>`. Interrupted runs are resumed, finished ones left alone; runs that
-were begun with other settings are refused. Ctrl-C, SIGTERM and SIGHUP stop the runs too, which
-save before they end.
+Trains the runs that are missing under `--runs`, `--jobs` at a time (on Linux each on its own
+cores), and writes `curves_<experiment>.csv` and `.png` to `--results`; for another agent than
+dreamerv3, `curves_<experiment>_<agent>`. Resumes interrupted runs, skips finished ones, and
+refuses runs that were started with other settings. Ctrl-C, SIGTERM and SIGHUP also stop the
+runs, which save first.
 """
 
 from __future__ import annotations
@@ -26,31 +26,31 @@ from vawm.sweep import children, figures, results, runs
 from vawm.sweep.runs import Sweep, Variant
 
 EXPERIMENTS = {pathlib.Path(suite.program).stem: name for name, suite in suites.SUITES.items()}
-"""Name of a program beside this one -> the suite on which it trains."""
+"""Name of a program in this folder -> the suite that it trains on."""
 FOLDER = pathlib.Path(__file__).resolve().parent
 
 
 @dataclass(frozen=True)
 class Options:
-    """Which runs, and where they go."""
+    """The runs, and their folders."""
 
     experiment: str = "dmc_proprio"
-    """the program that trains: the name of a file beside this one, such as gymnasium_task"""
+    """the program that trains: the name of a file in this folder, such as gymnasium_task"""
     agent: AgentName = "dreamerv3"
     tasks: tuple[str, ...] = ()
-    """any number of them; the usual ones of the suite if none"""
+    """one or more tasks; default those of the suite"""
     seeds: tuple[int, ...] = (0, 1, 2)
     alignments: tuple[str, ...] = ("adaptive", "off")
     """values of --value-alignment.weight"""
     preset: str = "quick"
     env_steps: int | None = None
-    """length of every run; that of the preset if not given"""
+    """length of every run; default that of the preset"""
     jobs: int = 1
-    """runs side by side"""
+    """runs at the same time"""
     runs: pathlib.Path = pathlib.Path("runs/learning_curves")
     results: pathlib.Path = FOLDER / "results"
     collect_only: bool = False
-    """write the results of the runs that are there, and start none"""
+    """write the results of existing runs, and start none"""
 
     @property
     def suite(self) -> str:
@@ -58,12 +58,12 @@ class Options:
 
     @property
     def name(self) -> str:
-        """Of the folder of its runs, and in the names of its results."""
+        """The name of the folder of runs, and part of the names of result files."""
         suffix = "" if self.agent == "dreamerv3" else f"_{self.agent}"
         return self.experiment + suffix
 
     def result(self, ending: str) -> pathlib.Path:
-        """Where a file of results goes."""
+        """The path of a result file."""
         return self.results / f"curves_{self.name}.{ending}"
 
 
@@ -90,11 +90,11 @@ def make_sweep(options: Options) -> Sweep:
 
 
 def check(options: Options, sweep: Sweep) -> None:
-    """Refuses what would only fail in every run, or after hours of them.
+    """Refuses options that would fail in every run, or only after hours.
 
     Raises:
       InvalidInput: names the option, its value and the remedy.
-      RunError: a package is missing.
+      RunError: a package is not installed.
     """
     for weight in options.alignments:
         weights = flags.choices(ValueAlignmentConfig, "weight")
@@ -118,7 +118,7 @@ def write(rows: results.Rows, options: Options, sweep: Sweep) -> None:
 
 
 def summary(rows: results.Rows, sweep: Sweep) -> str:
-    """Per run: the return of its last episodes, its best, and how long it took."""
+    """A line per run: the return of its last episodes, its best one, and its duration."""
     lines = []
     for run in runs.all_runs(sweep):
         own = results.of_run(rows, run)

@@ -1,19 +1,19 @@
-"""Ablation of capacity and of image size, with value alignment, without, and VaGraM: Fig. 2.
+"""Ablation of model size and image size, with and without value alignment, and VaGraM: Fig. 2.
 
     python experiments/ablations/capacity.py --jobs 2               # sizes of the model
     python experiments/ablations/capacity.py --vary image --jobs 2  # sizes of images
     python experiments/ablations/capacity.py --scale paper          # Fig. 2a
     python experiments/ablations/capacity.py --vary image --scale paper
 
-Models are up to three of the smallest of the agent: 1m, 12m and 25m of DreamerV3, 1m and 16m of
-STORM. Images are 64, 96 and 128 pixels a side, in the paper at its preset's size. VaGraM has
-the sizes and presets of DreamerV3 and is beside it; it is not beside STORM.
+Model sizes are the three smallest of the agent: 1m, 12m and 25m of DreamerV3, 1m and 16m of
+STORM. Images have 64, 96 and 128 pixels per side; with the scale `paper`, the model size is the
+preset's. VaGraM has the sizes and presets of DreamerV3 and is compared with it, not with STORM.
 
-The quick scale is short, with batches of 2 x 32 steps, for the sake of the large models: one
-seed, 8,000 or 6,000 environment steps, and somewhat more than twice the 300 updates in which
-learning rates of DreamerV3 and VaGraM rise. It shows that everything works at every size, how
-long a run takes, and how the table looks. It cannot show which size or method is better: at
-its end agents have hardly begun to learn.
+The quick scale is short because of the large models: batches of 2 x 32 steps, one seed, 8,000
+or 6,000 environment steps, and a little more than twice the 300 updates of the learning-rate
+warm-up of DreamerV3 and VaGraM. It shows that everything works at every size, how long a run
+takes, and what the table looks like. It cannot show which size or method is better: at its end,
+agents have hardly started to learn.
 """
 
 from __future__ import annotations
@@ -40,10 +40,10 @@ FEW_IMAGES = ("--num-envs", "2", "--train-ratio", "32", "--log-every", "500", *S
 
 @dataclass(frozen=True)
 class Options(ablation.Options):
-    """Which runs of an ablation, and where they go."""
+    """The runs of an ablation, and their folder."""
 
     vary: Literal["model", "image"] = "model"
-    """model: size of the agent, Fig. 2a; image: pixels a side, Fig. 2b"""
+    """model: size of the agent, Fig. 2a; image: pixels per side, Fig. 2b"""
 
 
 def crossed(agent: str, flag: str, sizes: Sequence[str]) -> tuple[Variant, ...]:
@@ -53,7 +53,7 @@ def crossed(agent: str, flag: str, sizes: Sequence[str]) -> tuple[Variant, ...]:
       InvalidInput: for VaGraM, which is one of the methods.
     """
     if agent == "vagram":
-        raise InvalidInput("agent", agent, "is beside dreamerv3 in its table; use that")
+        raise InvalidInput("agent", agent, "use dreamerv3, whose table includes vagram")
     methods = ALIGNMENTS | VAGRAM if agent == "dreamerv3" else ALIGNMENTS
     return tuple(
         Variant(f"{size} {name}", (flag, size, *words))

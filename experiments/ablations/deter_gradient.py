@@ -3,8 +3,8 @@
     python experiments/ablations/deter_gradient.py --jobs 2
     python experiments/ablations/deter_gradient.py --scale paper
 
-V(s) and V(s~) share h. Live, L_var may also reshape h so that the critic cares less about z;
-stopped, only z and z~ bring them together.
+V(s) and V(s~) share h. If the gradient is live, L_var may also change h such that the critic
+depends less on z; if it is stopped, L_var can only change z and z~.
 """
 
 from __future__ import annotations

@@ -3,9 +3,9 @@
     python experiments/ablations/noise.py --jobs 2
     python experiments/ablations/noise.py --scale paper
 
-With independent noise (the default, and how we read the paper) L_var is above 0 even where
-prior and posterior agree, unless the critic tells none of their samples apart. With shared
-noise z and z~ are then the same, and L_var is 0.
+With independent noise (the default, and our reading of the paper), L_var is above 0 even if
+prior and posterior agree, unless the critic does not distinguish their samples. With shared
+noise, z and z~ are equal in that case, and L_var is 0.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from vawm.sweep.runs import Variant
 
 
 def variants(agent: str) -> tuple[Variant, ...]:
-    """Both; none for an agent that draws nothing."""
+    """Both variants; refuses an agent that does not sample z."""
     if agent == "vagram":
-        raise InvalidInput("agent", agent, "draws no z, so there is no noise; use another")
+        raise InvalidInput("agent", agent, "does not sample z, so has no noise; use another")
     return tuple(
         Variant(noise, (*ablation.ADAPTIVE, "--value-alignment.noise", noise))
         for noise in ("independent", "shared")

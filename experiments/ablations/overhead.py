@@ -1,14 +1,13 @@
-"""Ablation of what value alignment costs: time and memory of a whole training step, Table 4.
+"""Ablation of the cost of value alignment: time and memory of a whole training step, Table 4.
 
     python experiments/ablations/overhead.py
     python experiments/ablations/overhead.py --scale paper
     python experiments/ablations/overhead.py --agent storm --scale paper
 
-Nothing is trained to the end, so there are no seeds and no runs: a process with value alignment
-and one without it, and without its metrics, take their steps in turn, environments and replay
-included. Absolute times depend on the machine; the overhead is the median over pairs. Peak
-memory is that of the accelerator; on a CPU, which does not tell, it is what XLA has planned for
-a step: arguments, replay among them, results and temporaries.
+Needs no whole runs and no seeds: a process with value alignment and one without it (and without
+its metrics) take turns, including environments and replay. Absolute times depend on the
+machine; the overhead is the median over pairs. Peak memory is that of the accelerator; on a CPU
+it is XLA's plan for a step: arguments (including replay), results and temporaries.
 """
 
 from __future__ import annotations

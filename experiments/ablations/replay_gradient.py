@@ -3,10 +3,10 @@
     python experiments/ablations/replay_gradient.py --jobs 2
     python experiments/ablations/replay_gradient.py --scale paper
 
-DreamerV3 as it is has the critic learn the values of replayed states too, and sends the
-gradient of that loss into the world model: it is value-aware before L_var is added. That is
-the main confound of comparisons with and without value alignment. Without that gradient one
-sees what L_var does by itself. STORM has no replay value loss, so it is refused.
+DreamerV3's critic also learns the values of replayed states, and the gradient of that loss goes
+into the world model. So DreamerV3 is value-aware even without L_var, which is the main confound
+of comparisons with and without value alignment. Without that gradient, the effect of L_var
+alone is visible. STORM has no replay value loss, so it is refused.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ ALIGNMENTS = {"adaptive": ablation.ADAPTIVE, "off": ablation.OFF}
 
 
 def variants(agent: str) -> tuple[Variant, ...]:
-    """All four; none for an agent without the loss."""
+    """All four variants; refuses an agent without the loss."""
     if not validate.preset(agent, "dmc_proprio", "quick").critic.replay_scale:
         raise InvalidInput("agent", agent, "has no replay value loss; use dreamerv3")
     return tuple(

@@ -4,11 +4,11 @@
     python experiments/ablations/weight.py --agent storm --scale paper
     python experiments/ablations/weight.py --agent storm --scale paper --tasks kung_fu_master
 
-The second is Table 3; the third is what Figs 9-11 are about, where the paper finds that a
-static weight of 50 aligns values at the cost of the dynamics. `ablation_weight_..._curves.png`
-has the dynamics loss, L_var before its weight, the weight itself and the KL of the latents over
-time, as Fig. 9; trajectories as in Figs 10 and 11 are `experiments/analyse.py --what
-trajectories --logdirs` of the runs.
+The second command is for Table 3, the third for Figs 9-11, where the paper finds that a static
+weight of 50 aligns values at the cost of the dynamics. `ablation_weight_..._curves.png` shows
+the dynamics loss, L_var before its weight, the weight and the KL of the latents over time, as
+Fig. 9. `experiments/analyse.py --what trajectories --logdirs RUNS` draws trajectories as in
+Figs 10 and 11.
 """
 
 from __future__ import annotations

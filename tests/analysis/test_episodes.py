@@ -1,4 +1,4 @@
-"""Recorded episodes: the same that a score counts, whole, with what begins a batch."""
+"""Recorded episodes: whole, the same as those of a score, with the memory for a batch."""
 
 import functools
 
@@ -11,6 +11,7 @@ import tiny_pixels
 import tiny_storm
 import tiny_vagram
 from analysis_records import make_policy
+from refusals import refused
 
 from vawm.agent import make_agent
 from vawm.analysis import episodes
@@ -45,7 +46,7 @@ def test_on_the_device_whole_first_episodes_are_recorded(record):
     np.testing.assert_allclose(record.returns, fit.sum(1), rtol=1e-5)
 
 
-def test_memory_is_what_replay_would_keep(policy, record):
+def test_memory_is_what_replay_would_store(policy, record):
     memory = record.memory
     agent = make_agent(policy.config, policy.spec)
     expected = agent.world_model.memory(agent.initial(2).memory)
@@ -56,7 +57,7 @@ def test_memory_is_what_replay_would_keep(policy, record):
 
 
 def test_a_policy_that_watches_its_own_episodes_remembers_the_same(policy, record):
-    """With the key that acted; where no latent is drawn, with any, whatever it would do."""
+    """With the key that acted; with any key if latents are not sampled."""
     if policy.config.agent == "vagram":
         again = episodes.watched_by(policy, record, seed=9)
         assert again.trajectory is record.trajectory
@@ -85,23 +86,23 @@ SPEC = tiny.env().spec
         ({"obs": vector(3)}, r"player='obs Shape.*\(3,\).*': b was trained with Shape.*\(2,\)"),
         ({"obs": {"a": vector(2)}}, "obs {'a': Shape.*: b was trained with Shape"),
         ({"obs": image(48)}, r"player='obs Shape.*uint8.*: b was trained with Shape.*float32"),
-        ({"action_size": 2}, "player='action_size 2': b was trained with 1; let a run of the"),
+        ({"action_size": 2}, "player='action_size 2': b was trained with 1"),
         ({"discrete": True}, "player='discrete True': b was trained with False"),
         ({"action_repeat": 2}, "player='action_repeat 2': b was trained with 1"),
     ],
 )
-def test_episodes_of_another_kind_are_not_watched(other, message):
+def test_episodes_of_other_environments_are_refused(other, message):
     with pytest.raises(InvalidInput, match=message) as error:
         episodes.check_can_watch("b", SPEC, SPEC._replace(**other))
     assert "\n" not in str(error.value)
 
 
-def test_how_many_environments_there_were_does_not_matter():
+def test_the_number_of_environments_does_not_matter():
     episodes.check_can_watch("b", SPEC, SPEC._replace(num_envs=9, episode_length=None))
 
 
 class Count:
-    """Episodes of 1 to 3 steps by their seed; observes how many steps there were."""
+    """Episodes of 1 to 3 steps, depending on the seed; observes the step."""
 
     obs = vector(1)
     action_size = 1
@@ -130,7 +131,7 @@ def still(spec):
 
 
 def test_on_the_host_the_episodes_of_a_score_are_recorded():
-    """Whole ones of different lengths, in the same order."""
+    """Whole episodes of different lengths, in the same order."""
     with Pool(Count, task="count", num_envs=2, workers=1) as env:
         record = episodes.record_in(env, still(env.spec), episodes=5, seed=1)
         score = play.on_host(env, still(env.spec), episodes=5, seed=1)
@@ -161,12 +162,12 @@ def test_windows_are_runs_of_steps_that_stop_at_the_last():
 
 def test_impossible_numbers_and_environments_are_refused(policy):
     env = tiny.env()
-    with pytest.raises(InvalidInput, match="episodes=0: use a whole number"):
+    with refused("episodes", 0):
         episodes.record_in(env, policy, episodes=0, seed=0)
-    with pytest.raises(InvalidInput, match="seed=-1"):
+    with refused("seed", -1):
         episodes.record_in(env, policy, episodes=2, seed=-1)
-    with pytest.raises(InvalidInput, match="episodes=3: the environments are 2"):
+    with refused("episodes", 3, naming="2"):
         episodes.record_in(env, policy, episodes=3, seed=0)
     endless = env._replace(spec=env.spec._replace(episode_length=None))
-    with pytest.raises(InvalidInput, match="has to say how long an episode can be"):
+    with refused("env", naming="episode_length"):
         episodes.record_in(endless, policy, episodes=2, seed=0)

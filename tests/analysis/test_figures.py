@@ -1,4 +1,4 @@
-"""Pictures: what is drawn is what was found."""
+"""Pictures: they show the numbers of the analysis."""
 
 import pathlib
 
@@ -22,13 +22,13 @@ def drawn(monkeypatch):
 
 
 def band(axes, index=0):
-    """Lower and upper edge of what is filled, at every depth."""
+    """Lower and upper edge of the band, at every depth."""
     x, y = axes.collections[index].get_paths()[0].vertices.T
     return np.array([[y[x == at].min(), y[x == at].max()] for at in np.unique(x)]).T
 
 
 def report():
-    """Two episodes of four states, of which the second has two."""
+    """Two episodes, of four states and of two."""
     rng = np.random.default_rng(0)
     errors = {name: rng.uniform(1, 2, (2, 3)) for name in values.MEASURES}
     errors["latent_kl"] = np.full((2, 3), np.nan)
@@ -85,7 +85,7 @@ def test_values_over_time_and_against_returns(drawn):
 
 
 def windows():
-    """A picture and two numbers; the last of five steps is not of the first episode."""
+    """A picture and two numbers; the last of five steps is outside the first episode."""
     rng = np.random.default_rng(0)
     truth = {
         "picture": rng.integers(0, 256, (2, 5, 48, 48, 3), dtype=np.uint8),
@@ -120,7 +120,7 @@ def test_a_strip_is_a_png_of_as_many_columns_as_fit(tmp_path):
     assert height == pytest.approx(3 * 1.2 * figures.DPI, abs=1)
 
 
-def test_coordinates_are_drawn_where_they_are_inside(drawn):
+def test_coordinates_are_drawn_inside_the_episode(drawn):
     shown = windows()
     figures.coordinates("run", shown, PATH)
     for i, ax in enumerate(drawn[PATH.name].axes):
@@ -145,7 +145,7 @@ def look(unit="symlog"):
     return Look(np.array([3, 4]), truth, Saliency(decoded, *maps, np.array([0.5, 2.0])), unit)
 
 
-def test_maps_are_drawn_over_what_was_seen(drawn):
+def test_maps_are_drawn_over_the_observed_images(drawn):
     seen = look()
     figures.saliency_images("run", seen, PATH)
     figure = drawn[PATH.name]
@@ -206,7 +206,7 @@ def test_curves_are_lines_with_bands_over_thousands_of_steps(drawn):
     np.testing.assert_array_equal(band(kl), [several.low, several.high])
 
 
-def test_heat_is_dark_grey_where_a_map_is_zero_and_colour_where_it_is_not():
+def test_heat_is_dark_grey_for_zeros_and_coloured_elsewhere():
     seen = np.full((1, 2, 2, 3), 200, np.uint8)
     maps = np.zeros((1, 2, 2))
     np.testing.assert_array_equal(figures.heat(seen, maps), np.full((1, 2, 2, 3), 100))

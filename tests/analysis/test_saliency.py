@@ -1,4 +1,4 @@
-"""Saliency against a Jacobian that is built, and through the straight-through gradient."""
+"""Saliency against an explicit Jacobian, and through the straight-through gradient."""
 
 import dataclasses
 from typing import NamedTuple
@@ -12,10 +12,10 @@ import tiny_pixels
 import tiny_storm
 import tiny_vagram
 from analysis_records import make_episodes, make_policy
+from refusals import refused
 
 from vawm.agent import Agent, make_agent
 from vawm.analysis import episodes, saliency
-from vawm.errors import InvalidInput
 from vawm.losses import transforms
 from vawm.policy import Policy
 from vawm.types import Batch, EnvSpec, Latent, vector
@@ -154,7 +154,7 @@ def test_the_observed_gradient_goes_through_the_probabilities_of_z(setting, stra
         assert (actual > 0).any()
 
 
-def test_where_nothing_is_drawn_the_observed_gradient_is_that_of_the_value():
+def test_without_sampling_the_observed_gradient_is_that_of_the_value():
     setting = make_setting(tiny_vagram.CONFIG, VECTORS, "raw")
     steps = setting.batch.trajectory
 
@@ -200,11 +200,11 @@ def test_rows_are_of_images_and_of_coordinates(setting):
             assert rows[kind, "concentration"] == saliency.concentration(pixels)
 
 
-def test_what_cannot_be_looked_at_is_refused(setting):
+def test_impossible_contexts_and_frames_are_refused(setting):
     policy, _, data, *_ = setting
-    with pytest.raises(InvalidInput, match="context=7: the first episode has 6 steps"):
+    with refused("context", 7, naming="6"):
         saliency.look(policy, data, context=7, frames=1, seed=0)
-    with pytest.raises(InvalidInput, match="frames=0: use a whole number"):
+    with refused("frames", 0):
         saliency.look(policy, data, context=3, frames=0, seed=0)
 
 

@@ -11,9 +11,9 @@ import tiny
 import tiny_storm
 import tiny_vagram
 from analysis_records import make_episodes, make_policy
+from refusals import refused
 
 from vawm.analysis import episodes, inference, values
-from vawm.errors import InvalidInput
 from vawm.types import Trajectory
 
 LENGTH, DEPTH, COUNT = (7, 4, 2), 3, 3
@@ -49,7 +49,8 @@ def bump_mean(center):
 
 
 def twin(steps, length, terminal):
-    """One episode in loops: errors, measure -> depth -> list over states; V of those left."""
+    """One episode in loops: errors, measure -> depth -> list over states; V of the states with
+    an action."""
     w, gamma = float(scalar_agent.PARAMS.critic), 0.9
     w_reward = float(scalar_agent.PARAMS.world_model)
     obs, reward, action = (np.asarray(x, np.float64).ravel() for x in steps)
@@ -101,7 +102,7 @@ def scalar():
 
 @pytest.fixture(scope="module")
 def loops(scalar):
-    """What `twin` makes of every episode."""
+    """The results of `twin` for every episode."""
     steps = scalar[0].trajectory
     return [
         twin(
@@ -114,7 +115,7 @@ def loops(scalar):
 
 
 @pytest.mark.parametrize("measure", values.MEASURES)
-def test_every_measure_is_that_of_the_loops(scalar, loops, measure):
+def test_every_measure_equals_that_of_the_loops(scalar, loops, measure):
     report, unit = scalar[2], 1.0
     if measure in values.RELATIVE:
         unit = np.std([value for _, left in loops for value in left])
@@ -182,7 +183,7 @@ def test_a_spread_by_hand():
 
 
 def told(errors, spread):
-    """A report of which only the errors and the spread are told."""
+    """A report with only errors and spread."""
     errors = np.array(errors)
     by_depth = values.ErrorByDepth(
         states={name: np.where(np.isnan(errors), 0, 4) for name in values.MEASURES},
@@ -221,7 +222,7 @@ def test_runs_are_the_units_of_a_group_by_hand():
     assert lines[-1] == "  alike (3 runs)   2"
 
 
-def test_what_lies_beyond_the_end_does_not_count(scalar):
+def test_steps_beyond_the_end_do_not_count(scalar):
     recorded, rolled, report = scalar
     length = np.array(LENGTH)[:, None]
     noise = jnp.where(np.arange(7) >= length, 1e3, recorded.trajectory.reward)
@@ -238,7 +239,7 @@ def test_what_lies_beyond_the_end_does_not_count(scalar):
 
 
 def test_returns_by_hand():
-    """Cut by a time limit: G_T is 0, or what the critic says of s_T."""
+    """Truncated by a time limit: G_T is 0, or the critic's value of s_T."""
     reward = [[9.0, 1.0, 2.0, 4.0, 9.0]]
     length = np.array([4])
     cut = values.discounted_returns(reward, length, np.zeros(1), discount=0.5)
@@ -258,7 +259,7 @@ def played(request):
     return policy, recorded, values.report(policy, recorded, context=3, depth=4, seed=0)
 
 
-def test_at_depth_zero_imagined_is_inferred(played):
+def test_at_depth_zero_the_imagined_state_is_the_inferred_one(played):
     by_depth = played[2].by_depth
     for measure in ("value", "value_kl", "distance"):
         assert (by_depth.errors[measure][:, 0] == 0).all()
@@ -297,7 +298,7 @@ def explained(played):
 
 
 def test_one_step_ahead_the_latent_kl_is_that_of_training(played, explained):
-    """For a world model that gives its logits; else it is not told."""
+    """For a world model that provides logits; NaN for others."""
     policy, _, report = played
     kl = report.by_depth.errors["latent_kl"]
     if policy.config.agent == "storm":
@@ -327,13 +328,13 @@ def test_a_prior_is_that_of_the_next_step(played, explained):
     np.testing.assert_allclose(logits, expected, atol=1e-5)
 
 
-def test_what_cannot_be_imagined_is_refused():
-    with pytest.raises(InvalidInput, match="depth=0: use a whole number"):
+def test_impossible_depths_and_contexts_are_refused():
+    with refused("depth", 0):
         inference.check(tiny.CONFIG, context=3, depth=0)
-    with pytest.raises(InvalidInput, match="context=1: use at least 2"):
+    with refused("context", 1, naming="2"):
         inference.check(tiny.CONFIG, context=1, depth=3)
     inference.check(tiny.CONFIG, context=8, depth=100)
-    with pytest.raises(InvalidInput, match="depth=6: use at most 5 after the context"):
+    with refused("depth", 6, naming="5"):
         inference.check(tiny_storm.CONFIG, context=3, depth=6)
-    with pytest.raises(InvalidInput, match="context=8: use less than 8"):
+    with refused("context", 8, naming="8"):
         inference.check(tiny_storm.CONFIG, context=8, depth=1)

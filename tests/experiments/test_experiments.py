@@ -181,17 +181,19 @@ def test_nothing_is_written_when_the_runs_were_stopped(options, monkeypatch, cap
     stopped = curves.children.Outcome([], 143)
     monkeypatch.setattr(curves.children, "run", lambda *_, **__: stopped)
     assert curves.main(words(options)) == 143
-    assert "the same command goes on" in capsys.readouterr().out
+    assert "stopped" in capsys.readouterr().out
     assert not options.results.exists()
 
 
-def test_a_missing_matplotlib_is_told_before_anything_is_trained(options, monkeypatch, capsys):
+def test_a_missing_matplotlib_is_reported_before_training(options, monkeypatch, capsys):
     monkeypatch.setattr(
         curves.runs.analysis_figures.importlib.util, "find_spec", lambda _: None
     )
     monkeypatch.setattr(curves.children, "run", None)
     assert command_line.guard(lambda: curves.main(words(options))) == 1
-    assert "pip install matplotlib" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert "matplotlib" in told
+    assert "pip install" in told
 
 
 def test_gradient_routes_are_those_of_the_equations():

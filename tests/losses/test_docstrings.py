@@ -1,4 +1,4 @@
-"""Every function of the library says where it is from, what it takes and what it gives."""
+"""Every loss documents its source, arguments, results and gradients."""
 
 import inspect
 import re
@@ -37,7 +37,7 @@ def test_a_docstring_names_source_arguments_result_and_errors(name):
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
-def test_a_docstring_says_which_shapes_and_which_gradients(name):
+def test_a_docstring_names_shapes_and_gradients(name):
     text = inspect.getdoc(FUNCTIONS[name])
     assert re.search(r"`\[[^`]*\]`", section(text, "Returns"))
     if name != "init_return_scale":  # of constants
@@ -45,6 +45,6 @@ def test_a_docstring_says_which_shapes_and_which_gradients(name):
 
 
 @pytest.mark.parametrize("kind", [losses.PredictionLoss, losses.ReturnScale])
-def test_a_result_with_parts_says_their_shapes_and_its_equation(kind):
+def test_a_result_with_parts_documents_their_shapes_and_its_equation(kind):
     assert re.search(r"Eq\. \d", kind.__doc__)
     assert "`[...]`" in kind.__doc__ or "# [] float32" in inspect.getsource(kind)

@@ -1,4 +1,4 @@
-"""The losses alone: what a fresh process has imported once it can use them."""
+"""The losses import nothing else of the package."""
 
 import pathlib
 import shutil
@@ -11,7 +11,7 @@ HEAVY = {"flax", "distrax", "optax", "gymnasium", "mujoco", "dm_control", "orbax
 
 
 def imported(code, **where):
-    """The names of the modules that a fresh process has after `code`."""
+    """The names of the modules that a new process has loaded after `code`."""
     done = subprocess.run(
         [sys.executable, "-c", f"{code}; import sys; print(*sys.modules)"],
         capture_output=True,

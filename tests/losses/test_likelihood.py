@@ -112,14 +112,14 @@ def test_free_nats_are_applied_after_the_sum_and_at_each_state():
     assert kl[1] == 0
 
 
-def test_dynamics_term_moves_the_prior_alone():
+def test_dynamics_term_moves_only_the_prior():
     post, prior = logits(3.0)
     to_post, to_prior = gradients(post, prior, **KL | {"representation_scale": 0.0})
     np.testing.assert_array_equal(to_post, np.zeros_like(post))
     assert (np.abs(to_prior) > 0).any()
 
 
-def test_representation_term_moves_the_posterior_alone():
+def test_representation_term_moves_only_the_posterior():
     post, prior = logits(3.0)
     to_post, to_prior = gradients(post, prior, **KL | {"dynamics_scale": 0.0})
     np.testing.assert_array_equal(to_prior, np.zeros_like(prior))
@@ -156,12 +156,12 @@ def test_batch_dynamics_loss_matches_its_twin(scale, unimix):
 
 
 def far_off(state):
-    """Posteriors that are priors but in one state; its KL is about 3.2 nats."""
+    """Posteriors equal to priors except in one state, whose KL is about 3.2 nats."""
     post = jnp.zeros((8, 32, 2))
     return post.at[state, :, 0].set(0.9), jnp.zeros_like(post)
 
 
-def test_below_the_free_nats_of_a_batch_no_state_has_a_gradient_however_far_off_it_is():
+def test_below_the_free_nats_of_a_batch_no_state_has_a_gradient():
     post, prior = far_off(3)
     loss, kl = batch_dynamics_loss(post, prior, **KL)
     assert kl[3] > KL["free_nats"] > kl.mean()
@@ -175,7 +175,7 @@ def test_below_the_free_nats_of_a_batch_no_state_has_a_gradient_however_far_off_
 
 
 def test_above_the_free_nats_of_a_batch_every_state_has_its_gradient():
-    """That of the mean KL: also a state whose own KL is below has one."""
+    """The gradient of the mean KL: also for a state whose own KL is below."""
     post, prior = logits(3.0)
     post = post.at[0, 0].set(0.1 * post[0, 0])
     prior = prior.at[0, 0].set(0.1 * prior[0, 0])
@@ -258,7 +258,7 @@ def test_continue_loss_is_least_at_the_target():
 
 
 def heads_and_targets(obs):
-    """What heads say of 2 x 3 steps and what was there, some of it terminal."""
+    """Predictions and targets of 2 x 3 steps, some of them terminal."""
     rng = np.random.default_rng(0)
     reward = 3 * rng.normal(size=(2, 3))
     is_terminal = np.array([[False, True, False], [False, False, True]])
@@ -302,7 +302,7 @@ def test_prediction_loss_matches_its_twin(kind):
         np.testing.assert_allclose(part, twin, rtol=1e-5)
 
 
-def test_prediction_loss_adds_up_what_is_observed():
+def test_prediction_loss_sums_over_observations():
     vector, image = observations()
     arrays = heads_and_targets({"vector": vector, "image": image})
     actual = prediction_loss(*arrays, bins=BINS, discount=0.9)
@@ -358,7 +358,7 @@ def test_each_part_of_the_prediction_loss_moves_its_own_head_and_no_target():
     ],
     ids=["whole numbers", "images of floats", "another time", "no batch", "another tree"],
 )
-def test_prediction_loss_refuses_observations_that_are_not_one_for_each_state(obs):
+def test_prediction_loss_refuses_observations_of_another_shape(obs):
     _, *logits, _, reward, is_terminal = heads_and_targets(observations()[0])
     predicted = obs["vector"] if isinstance(obs, dict) else obs
     with pytest.raises(AssertionError):

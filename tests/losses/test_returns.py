@@ -100,7 +100,7 @@ def test_replay_returns_match_the_recursion(lambda_):
     np.testing.assert_allclose(actual, twin, rtol=1e-5, atol=1e-6)
 
 
-def test_replay_returns_bootstrap_where_an_episode_is_cut_and_not_where_it_ends():
+def test_replay_returns_bootstrap_at_truncation_and_not_at_termination():
     reward = jnp.array([[100.0, 1.0, 2.0, 4.0], [100.0, 1.0, 2.0, 4.0]])
     is_last = jnp.array([[False, False, True, False]] * 2)
     is_terminal = is_last & jnp.array([[False], [True]])
@@ -112,7 +112,7 @@ def test_replay_returns_bootstrap_where_an_episode_is_cut_and_not_where_it_ends(
     np.testing.assert_allclose(actual, [[4.5, 7.0, 9.0], [2.0, 2.0, 9.0]])
 
 
-def test_replay_returns_ignore_what_follows_the_end_of_an_episode():
+def test_replay_returns_ignore_steps_after_the_end_of_an_episode():
     reward = jnp.zeros((1, 5))
     is_last = jnp.array([[False, False, True, False, False]])
     bootstrap = jnp.zeros((1, 5))

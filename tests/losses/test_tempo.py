@@ -126,7 +126,7 @@ def test_the_example_of_the_docstring_by_hand():
     np.testing.assert_allclose([to_scores @ x, to_scores @ y], [1.6889, -4.3911], atol=5e-5)
 
 
-def test_a_step_of_no_size_has_no_gradient():
+def test_a_step_of_size_zero_has_no_gradient():
     value, gradient = scalar_gradient(step_size=0.0)
     assert value == 2
     np.testing.assert_array_equal(gradient, np.zeros(2))
@@ -154,7 +154,7 @@ def test_gradient_is_its_closed_form():
         np.testing.assert_allclose(gradient[name], expected[name], rtol=1e-4, atol=1e-6)
 
 
-def test_a_layer_without_a_second_derivative_will_do():
+def test_a_layer_without_a_second_derivative_is_enough():
     @jax.custom_vjp
     def sin(x):
         return jnp.sin(x)

@@ -1,4 +1,4 @@
-"""VaGraM: float64 twins of its four forms, their inequalities, and where gradients go."""
+"""VaGraM: float64 twins of its four forms, their inequalities, and their gradients."""
 
 import jax
 import jax.numpy as jnp
@@ -157,7 +157,7 @@ numbers = st.floats(-3, 3, width=32)
 
 @jax.jit
 def all_forms(gradient, hessian, error):
-    """Every form at x = 0 for V = g . x + 1/2 x' H x, whose derivatives are what is given."""
+    """Every form at x = 0 for V = g . x + 1/2 x' H x, with the given derivatives."""
 
     def value(x):
         return x @ gradient + 0.5 * ((x @ hessian) * x).sum(-1)

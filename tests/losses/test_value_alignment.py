@@ -63,7 +63,7 @@ def test_loss_and_gradient_of_a_zero_initialised_critic_are_exactly_zero():
     np.testing.assert_array_equal(gradient, np.zeros_like(features))
 
 
-def test_first_term_moves_the_prediction_alone():
+def test_first_term_moves_only_the_prediction():
     value, prior = pair()
     to_value, to_prior = gradients(value, prior, dynamics_scale=0.5, representation_scale=0.0)
     np.testing.assert_array_equal(to_value, np.zeros_like(value))
@@ -71,7 +71,7 @@ def test_first_term_moves_the_prediction_alone():
     np.testing.assert_allclose(to_prior, twin, atol=1e-6)
 
 
-def test_second_term_moves_the_inference_alone():
+def test_second_term_moves_only_the_inference():
     value, prior = pair()
     to_value, to_prior = gradients(value, prior, dynamics_scale=0.0, representation_scale=0.1)
     np.testing.assert_array_equal(to_prior, np.zeros_like(prior))

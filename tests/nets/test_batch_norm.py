@@ -33,7 +33,7 @@ def normalised(x, scale, bias):
 
 
 @pytest.mark.parametrize("axes", [1, 2, 3])
-def test_in_training_the_batch_normalises_and_moves_the_statistics_a_tenth(axes):
+def test_training_normalises_by_the_batch_and_moves_the_statistics_by_a_tenth(axes):
     module, variables = module_and_variables()
     x = images().reshape(*((24,), (4, 6), (4, 2, 3))[axes - 1], FEATURES)
     y, updated = module.apply(variables, x, train=True, mutable=["statistics"])
@@ -46,7 +46,7 @@ def test_in_training_the_batch_normalises_and_moves_the_statistics_a_tenth(axes)
         np.testing.assert_allclose(after, 0.9 * before + 0.1 * batch, rtol=1e-6)
 
 
-def test_otherwise_the_running_statistics_normalise_and_stay():
+def test_otherwise_the_running_statistics_normalise_and_do_not_change():
     module, variables = module_and_variables()
     x = images()
     y, updated = module.apply(variables, x, train=False, mutable=["statistics"])
@@ -59,13 +59,13 @@ def test_otherwise_the_running_statistics_normalise_and_stay():
 
 
 @pytest.mark.parametrize("train", [False, True])
-def test_statistics_start_at_0_and_1_whatever_init_saw(train):
+def test_statistics_start_at_0_and_1_whatever_the_input_of_init(train):
     variables = BatchNorm(FEATURES).init(jax.random.key(0), images(offset=5.0), train=train)
     np.testing.assert_array_equal(variables["statistics"]["mean"], np.zeros(FEATURES))
     np.testing.assert_array_equal(variables["statistics"]["var"], np.ones(FEATURES))
 
 
-def test_nothing_cancels_where_the_mean_is_a_thousand_deviations():
+def test_a_mean_of_a_thousand_deviations_causes_no_cancellation():
     x = jax.random.normal(jax.random.key(0), (64, 4, FEATURES)) + 1000.0
     _, mean, var = batch_norm.normalise(x, jnp.ones(FEATURES), jnp.zeros(FEATURES))
     flat = np.asarray(x, np.float64).reshape(-1, FEATURES)
@@ -94,7 +94,7 @@ def test_gradients_pass_through_the_batch_s_mean_and_variance():
         np.testing.assert_allclose(a, b, atol=1e-5)
 
 
-def test_statistics_pass_no_gradient_on():
+def test_statistics_have_no_gradient():
     module, variables = module_and_variables()
 
     def moved(x):

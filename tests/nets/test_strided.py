@@ -101,7 +101,7 @@ def test_gradients_equal_those_of_xla_s_convolutions(
 
 
 @pytest.mark.parametrize("scheme", [strided.SAVING, strided.WRITTEN_OUT])
-def test_what_takes_apart_and_what_puts_together_are_transposes(scheme):
+def test_to_and_of_are_transposes_of_each_other(scheme):
     """<of(x), m> = <x, to(m)>, of the fine image, the coarse one and the kernel."""
     fine, kernel = image_and_kernel(2, 8, 12, 16, 5)
     coarse = jax.random.normal(jax.random.key(1), (2, 4, 6, 5))
@@ -161,7 +161,7 @@ def uneven(variables):
 
 
 class Twin:
-    """Both networks in float64; collects the statistics that a batch would leave."""
+    """Both networks in float64; collects the running statistics after a batch."""
 
     def __init__(self, variables, train):
         self.params, self.statistics = (float64(variables[k]) for k in ("params", "statistics"))
@@ -200,7 +200,7 @@ each_network = pytest.mark.parametrize("name", NETWORKS)
 @each_network
 @pytest.mark.parametrize("train", [False, True])
 def test_networks_equal_their_definitions(name, train):
-    """In training they also leave the statistics that torch would."""
+    """In training they also compute the running statistics of torch."""
     build, twin_of = NETWORKS[name]
     module, variables, x = build()
     twin = Twin(variables, train)
@@ -212,8 +212,8 @@ def test_networks_equal_their_definitions(name, train):
 
 @each_network
 @pytest.mark.parametrize("count", [64, 67])
-def test_images_give_in_a_large_batch_what_they_give_alone(name, count):
-    """With running statistics. On CPU 32 images go through at a time, then the rest."""
+def test_a_large_batch_gives_the_same_as_single_images(name, count):
+    """With running statistics. A CPU processes 32 images at a time, then the rest."""
     module, variables, x = NETWORKS[name][0](count)
     together, _ = apply(module, variables, x, train=False)
     assert len(together) == count
@@ -272,8 +272,8 @@ def test_parameters_at_full_size_are_storm_s():
     assert sizes(decoder, z) == {"params": everything, "statistics": norms}
 
 
-def test_kernels_start_within_torch_s_bounds():
-    """1 / sqrt(fan-in); torch takes a transposed convolution's outputs for its inputs."""
+def test_kernels_start_within_torchs_bounds():
+    """1 / sqrt(fan-in); torch's fan-in of a transposed convolution counts its outputs."""
     encoder, decoder = StridedEncoder(3, 8), StridedDecoder(512, 16, 3, 8)
     params = init(encoder, jnp.zeros((1, 16, 16, 3)))["params"]
     bounds = [(params[f"stages_{i}"]["kernel"], 16 * n) for i, n in enumerate((3, 8, 16, 32))]
@@ -303,9 +303,9 @@ def test_bfloat16_products_keep_float32_parameters_and_statistics(name):
 
 @pytest.mark.parametrize("size", [0, 8, 40])
 def test_sides_that_four_halvings_do_not_divide_are_refused(size):
-    with pytest.raises(ValueError, match=f"multiples of 16, got {size}"):
+    with pytest.raises(ValueError, match=rf"16.*{size}"):
         init(StridedDecoder(FEATURES, size, CHANNELS), jnp.zeros((1, FEATURES)))
-    with pytest.raises(ValueError, match=f"multiples of 16, got {size}"):
+    with pytest.raises(ValueError, match=rf"16.*{size}"):
         init(StridedEncoder(CHANNELS), jnp.zeros((1, 16, size, CHANNELS)))
 
 

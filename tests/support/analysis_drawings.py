@@ -1,10 +1,10 @@
-"""What matplotlib was asked to draw, without drawing it."""
+"""Records what matplotlib would draw, without drawing it."""
 
 from matplotlib.figure import Figure
 
 
 def keep(monkeypatch):
-    """Figures by the names of their files, of which none is written from here on."""
+    """Keeps figures by the name of their file instead of writing them."""
     figures = {}
     monkeypatch.setattr(
         Figure, "savefig", lambda self, path, **_: figures.update({path.name: self})
@@ -13,10 +13,10 @@ def keep(monkeypatch):
 
 
 def lines(axes):
-    """The y of every line, by its label."""
+    """The y values of every line, by label."""
     return {line.get_label(): line.get_ydata() for line in axes.lines}
 
 
 def pictures(figure):
-    """What every panel shows, in order."""
+    """The content of every panel, in order."""
     return [axes.get_images()[0].get_array() for axes in figure.axes]

@@ -1,4 +1,4 @@
-"""Policies with made-up parameters, and made-up episodes: nothing is compiled for them."""
+"""Policies with random parameters, and random episodes, without compiling anything."""
 
 import json
 
@@ -15,7 +15,7 @@ from vawm.types import Trajectory
 
 
 def make_policy(config, spec, seed=0):
-    """Noise for parameters, so that every head says something; ones beside them."""
+    """Random parameters, so that every head has an output; ones for the model state."""
     agent, rng = make_agent(config, spec), np.random.default_rng(seed)
     params, state = jax.eval_shape(agent.init, jax.random.key(0))
     params = jax.tree.map(
@@ -27,7 +27,7 @@ def make_policy(config, spec, seed=0):
 
 
 def save_run(logdir, policy, *, env_steps=8):
-    """The folder of a run that saved what acting needs, with two lines of metrics."""
+    """The folder of a run that saved what is needed to act, with two lines of metrics."""
     state = toy.state()
     learner = state.learner._replace(params=policy.params, model_state=policy.state)
     checkpoint.save(
@@ -45,7 +45,7 @@ def save_run(logdir, policy, *, env_steps=8):
 
 
 def make_episodes(policy, *, episodes, length, seed=0):
-    """Noise for observations, rewards and actions; the last step of each is not terminal."""
+    """Random observations, rewards and actions; the last steps are not terminal."""
     rng, shape = np.random.default_rng(seed), (episodes, length)
 
     def draw(leaf):

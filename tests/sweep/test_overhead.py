@@ -1,4 +1,4 @@
-"""Two processes that take turns: what they are asked, and what is made of their answers."""
+"""Two processes that take turns: the orders they get, and the table of their answers."""
 
 import io
 import json
@@ -17,7 +17,7 @@ from vawm.runs.runner import RunError
 from vawm.sweep import costs, overhead
 from vawm.sweep.runs import Run, Sweep, Variant
 
-# Answers as `vawm.sweep.overhead` does, and writes down who was asked when.
+# Answers as `vawm.sweep.overhead` does, and records the order of the calls.
 PROGRAM = """
 import json, sys
 log, name = sys.argv[1], sys.argv[3]
@@ -55,11 +55,11 @@ def test_variants_take_turns_and_the_first_samples_do_not_count(log):
 
 
 def test_a_variant_that_cannot_be_measured_is_named(log):
-    with pytest.raises(RunError, match="measuring broken ended with exit code 7"):
+    with pytest.raises(RunError, match=r"broken .*7"):
         overhead.compare("dmc_proprio", [["on"], ["broken"]], repeats=1)
 
 
-def test_the_table_is_the_one_worked_by_hand(log):
+def test_the_table_equals_one_computed_by_hand(log):
     owned = [Run("task", name, 0) for name in ("on", "off")]
     rows = costs.rows_of(owned, overhead.compare("any", [["on"], ["off"]], repeats=3))
     table = costs.markdown(rows, notes="Two.", command="python it.py").splitlines()
@@ -68,10 +68,10 @@ def test_the_table_is_the_one_worked_by_hand(log):
         "| task | on | 8 (7 to 9) | 100.0 % (100.0 to 100.0) | 3.00 GiB (+50.0 %) | 0.222 |",
         "| task | off | 4 (3.5 to 4.5) | - | 2.00 GiB | 0.111 |",
     ]
-    assert "task: 2 updates and 32 environment steps a sample, 3 samples." in table
+    assert "task: 2 updates and 32 environment steps per sample, 3 samples." in table
 
 
-def test_the_numbers_are_kept_and_drawn(log, tmp_path):
+def test_the_numbers_are_written_and_drawn(log, tmp_path):
     variants = tuple(Variant(name, ()) for name in ("on", "off"))
     sweep = Sweep(tmp_path, tmp_path, variants, ("task",), (0,))
     owned = [Run("task", name, 0) for name in ("on", "off")]
@@ -98,10 +98,10 @@ def test_quartiles_are_those_of_numpy(count):
         (presets.PAPER, 1),
         (presets.ATARI_PAPER, 4),  # 256 of the 1024 of an update
         (presets.STORM, 1),
-        (tiny.config(train_ratio=3, collect_steps=1), 8),  # 6, and an update has 16
+        (tiny.config(train_ratio=3, collect_steps=1), 8),  # 6 of the 16 of an update
     ],
 )
-def test_a_sample_owes_no_part_of_an_update(config, steps):
+def test_a_sample_has_a_whole_number_of_updates(config, steps):
     earned = config.num_envs * config.collect_steps * config.train_ratio
     owed = [earned * n % config.replay.batch_steps for n in range(1, steps + 1)]
     assert overhead.steps_of_a_sample(config) == steps
@@ -126,7 +126,7 @@ def test_planned_memory_is_of_the_largest_program_and_counts_donated_arguments_o
 
 
 class FakeTrainer:
-    """Learns in every fourth step."""
+    """A trainer with an update in every fourth step."""
 
     init = staticmethod(lambda seed: 0)
     compile = staticmethod(lambda state: trainer.CompiledStep(FakeTrainer.step, EXECUTABLES))

@@ -1,7 +1,7 @@
 """Losses and the weight of value alignment in training, from `metrics.jsonl`: Figs 8, 9, 12.
 
-Runs that differ in nothing but their seed, and in what a resumed run may change, are one group:
-its curve is their mean, with the lowest and the highest of them around it.
+Runs that differ only in their seed, or in fields that a resumed run may change, are one group.
+The curve of a group is the mean over its runs, with a band from the lowest to the highest run.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ METRICS = (
     "value_alignment/kl",
     "value_alignment/weight",
 )
-"""Dynamics loss, that of VaGraM, and KL; L_var of Eq. 4 without its weight, logged also where
-it is off; the KL of the critic's distributions; the weight of Eq. 5."""
+"""The dynamics loss, the loss of VaGraM, the KL of z; L_var of Eq. 4 without its weight (also
+logged if it is off), the KL of the critic's distributions, the weight of Eq. 5."""
 
 
 class Run(NamedTuple):
-    """What a folder holds: the choices of a run, and its lines of metrics."""
+    """A run's config and its lines of metrics."""
 
     config: Config
     lines: list[Line]
 
 
 class Curve(NamedTuple):
-    """One metric of one group of runs, over env steps; all `[P]` but the number of seeds."""
+    """One metric of one group of runs over env steps; all `[P]` except `seeds`."""
 
     env_steps: np.ndarray
     mean: np.ndarray
@@ -48,28 +48,28 @@ class Curve(NamedTuple):
 
 
 def read(logdir: pathlib.Path) -> Run:
-    """The run in `logdir`.
+    """Reads the run in `logdir`.
 
     Raises:
-      InvalidInput: there is none that measured anything.
+      InvalidInput: there is no run, or it has no metrics.
     """
     config, path = run_folder.read_config(logdir), logdir / "metrics.jsonl"
     lines = tracking.read(path) if path.exists() else []
     if config is None or not lines:
-        remedy = "holds no metrics; name the folder of a run that wrote some"
+        remedy = "contains no metrics; use the folder of a run that has written some"
         raise InvalidInput("logdirs", str(logdir), remedy)
     return Run(config, lines)
 
 
 def describe(config: Config) -> str:
-    """Task, agent, and what its value alignment is."""
+    """Task, agent, and kind of value alignment."""
     alignment = config.value_alignment
     weight = f" {alignment.static_weight:g}" if alignment.weight == "static" else ""
     return f"{config.task}, {config.agent}, alignment {alignment.weight}{weight}"
 
 
 class Configured(Protocol):
-    """A run, whatever else is known of it."""
+    """Anything with the config of a run."""
 
     @property
     def config(self) -> Config: ...
@@ -79,9 +79,9 @@ AnyRun = TypeVar("AnyRun", bound=Configured)
 
 
 def group(runs: Sequence[AnyRun]) -> dict[str, list[AnyRun]]:
-    """Runs by what they share, in the order of the first of each.
+    """Groups runs by their common choices, in the order of each group's first run.
 
-    Groups of one description that differ in other choices get numbers.
+    Groups with the same description that differ in other choices are numbered.
     """
     groups: list[list[AnyRun]] = []
     for run in runs:
@@ -103,16 +103,16 @@ def _alike(a: Config, b: Config) -> bool:
 
 
 def _choices(config: Config) -> dict[str, Any]:
-    """All that the runs of a group have in common."""
+    """The choices that the runs of a group have in common."""
     free = {"seed", *resume.MAY_DIFFER}
     return {name: value for name, value in validate.values(config) if name not in free}
 
 
 def curve(runs: Sequence[Run], metric: str) -> Curve | None:
-    """Mean and range of a metric over runs; None where some run never measured it.
+    """Mean and range of a metric over runs; None if a run never measured it.
 
-    On the env steps of all of them, where all have begun and none has ended; between its own
-    lines a run is interpolated linearly.
+    Covers the env steps of all runs in their common range; a run is interpolated linearly
+    between its lines.
     """
     points = [
         [
@@ -131,11 +131,14 @@ def curve(runs: Sequence[Run], metric: str) -> Curve | None:
 
 
 def aligned(series: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """`[P]` steps at which any of the series has a value and which all reach around, and
-    `[S, P]` the values of each there, straight between its own.
+    """Interpolates series linearly onto common steps.
 
     Args:
       series: each `[2, n]`, steps and values; at least one, none empty.
+
+    Returns:
+      `[P]` the steps of all series within their common range, and `[S, P]` the value of each
+      series there.
     """
     begin, end = max(s[0][0] for s in series), min(s[0][-1] for s in series)
     steps = np.unique(np.concatenate([s[0] for s in series]))
@@ -144,11 +147,11 @@ def aligned(series: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 
 
 Curves = dict[str, dict[str, Curve]]
-"""Group -> metric -> curve; metrics that were not measured are left out."""
+"""Group -> metric -> curve, without metrics that were not measured."""
 
 
 def curves(groups: Mapping[str, Sequence[Run]]) -> Curves:
-    """All of `METRICS`."""
+    """The curves of all `METRICS`."""
     found = {
         name: {metric: curve(runs, metric) for metric in METRICS}
         for name, runs in groups.items()
@@ -160,7 +163,7 @@ def curves(groups: Mapping[str, Sequence[Run]]) -> Curves:
 
 
 def rows(all_curves: Curves) -> list[dict[str, Any]]:
-    """For a CSV: one row per group, metric and point."""
+    """Rows for a CSV, one per group, metric and point."""
     return [
         {
             "group": name,

@@ -1,12 +1,11 @@
-"""Whole episodes of a trained policy, step by step, with what its world model remembers.
+"""Records whole episodes of a trained policy, with the memory of its world model.
 
-As in `vawm.policy.play`, which episodes there are is fixed before the first begins.
-Environments are those of the run's own config, so rewards and ends are those that the critic
-was trained on.
+As in `vawm.policy.play`, the episodes are fixed in advance. The environments are those of the
+run's config, so rewards and ends of episodes are those that the critic was trained on.
 
-World models that are judged each on its own policy's episodes differ in where they are judged
-too. To compare them on the same steps, one policy plays, and every world model remembers anew
-what it would have, had it watched: `watched_by`.
+If each world model were judged on episodes of its own policy, they would be judged on different
+states. To compare them on the same steps, one policy plays, and `watched_by` recomputes the
+memory of every world model from the recorded steps.
 """
 
 from __future__ import annotations
@@ -29,20 +28,20 @@ from vawm.types import Batch, EnvSpec, Key, Params, PyTree, TimeStep, Trajectory
 
 
 class Episodes(NamedTuple):
-    """E episodes side by side, each from its first step on.
+    """E episodes, each from its first step on.
 
-    Steps from `length` on are of no episode that was asked for: they only complete the shape.
+    Steps from `length` on are padding.
 
     Attributes:
       trajectory: `[E, T, ...]`.
-      memory: `[E, T, ...]` what replay would keep beside every step, from which a `Batch`
-        begins; `()` for nothing.
-      length: `[E]` int32, steps, the first and the last of the episode among them.
+      memory: `[E, T, ...]` the memory that replay would store with every step, from which a
+        `Batch` starts; `()` for none.
+      length: `[E]` int32, number of steps, including the first and the last.
     """
 
     trajectory: Trajectory
     memory: PyTree
-    length: Any  # of jax or of numpy, as all leaves
+    length: Any  # a jax or numpy array, as all leaves
 
     @property
     def returns(self) -> np.ndarray:
@@ -53,7 +52,7 @@ class Episodes(NamedTuple):
 
 
 def record(policy: Policy, *, episodes: int, seed: int, how: How = "sample") -> Episodes:
-    """Plays `episodes` whole episodes in the environments of the policy's own config.
+    """Plays `episodes` whole episodes in the environments of the policy's config.
 
     Raises:
       InvalidInput: a number of episodes that is not positive, or an impossible seed.
@@ -75,8 +74,8 @@ def record_in(
     """As `record`, in any environments; a jittable one needs `num_envs == episodes`.
 
     Raises:
-      InvalidInput: also for environments of another kind than the policy's, and for a jittable
-        one whose episodes have no fixed length.
+      InvalidInput: as `record`; or the environments do not fit the policy, or are jittable
+        without an episode length.
     """
     evaluate.check(episodes, seed)
     evaluate.check_env(policy, env)
@@ -84,10 +83,10 @@ def record_in(
     if not isinstance(env, Environment):
         return on_host(env, policy, agent, episodes=episodes, seed=seed, how=how)
     if env.spec.num_envs != episodes:
-        remedy = f"the environments are {env.spec.num_envs}, one for each; use that"
+        remedy = f"use {env.spec.num_envs}, one episode per environment"
         raise InvalidInput("episodes", episodes, remedy)
     if env.spec.episode_length is None:
-        raise InvalidInput("env", env.spec.task, "has to say how long an episode can be")
+        raise InvalidInput("env", env.spec.task, "set the episode_length of its spec")
 
     def play(params: Params, state: PyTree, key: Key) -> Episodes:
         own = policy._replace(params=params, state=state)
@@ -127,7 +126,7 @@ def on_host(
     seed: int,
     how: How = "sample",
 ) -> Episodes:
-    """`episodes` whole episodes, a share in each of N environments, in the order of these."""
+    """`episodes` whole episodes, an equal share from each of N environments, in their order."""
     num_envs = env.spec.num_envs
     share = [len(range(i, episodes, num_envs)) for i in range(num_envs)]
     whole: list[list[list[PyTree]]] = [[] for _ in range(num_envs)]
@@ -153,7 +152,7 @@ def on_host(
 
 
 def join(episodes: Sequence[Sequence[PyTree]]) -> Episodes:
-    """Lists of `(step of a trajectory, memory)`; short ones repeat their last step."""
+    """Joins lists of `(step of a trajectory, memory)`; pads short ones with their last step."""
     length = max(map(len, episodes))
     rows = [
         jax.tree.map(lambda *x: np.stack(x), *episode, *[episode[-1]] * (length - len(episode)))
@@ -166,17 +165,17 @@ def join(episodes: Sequence[Sequence[PyTree]]) -> Episodes:
 def remember(
     agent: Agent, params: Params, state: PyTree, key: Key, trajectory: Trajectory
 ) -> PyTree:
-    """`[E, T, ...]` what replay would keep beside every recorded step, had this agent seen it.
+    """`[E, T, ...]` the memory that this agent would have after watching the recorded steps.
 
-    The agent acts, `Agent.act`, but what leaves from a step is the action that was recorded.
-    So the agent that recorded the steps finds again what it remembered: with the same key,
-    and, where its latents are not drawn, with any. Pure; can be jitted.
+    The agent acts with `Agent.act`, but its action is replaced by the recorded one. So the
+    agent that recorded the steps gets the same memory again, given the same key (any key, if
+    its latents are not sampled). Pure; can be jitted.
 
     Args:
-      agent: whose world model watches.
+      agent: with the world model that watches.
       params: of the agent.
       state: of its world model.
-      key: for latents.
+      key: for sampling latents.
       trajectory: `[E, T, ...]`, from the first steps of episodes on.
     """
     episodes, length = trajectory.reward.shape
@@ -193,9 +192,9 @@ def remember(
 
 
 def watched_by(policy: Policy, episodes: Episodes, *, seed: int) -> Episodes:
-    """The same steps, beside them what the world model of `policy` remembers of them.
+    """The same steps, with the memory of the world model of `policy`.
 
-    Whether it could have seen such steps is for `check_can_watch`.
+    `check_can_watch` tells whether the steps fit the policy.
     """
     agent = make_agent(policy.config, policy.spec)
     infer = jax.jit(functools.partial(remember, agent))
@@ -205,12 +204,12 @@ def watched_by(policy: Policy, episodes: Episodes, *, seed: int) -> Episodes:
 
 
 def check_can_watch(name: str, spec: EnvSpec, player: EnvSpec) -> None:
-    """Refuses to judge a run on episodes of environments that are not like its own.
+    """Refuses to judge a run on episodes from other environments than its own.
 
     Args:
       name: of the run.
       spec: of the environments that it was trained in.
-      player: of those that are played.
+      player: spec of the environments that are played.
 
     Raises:
       InvalidInput: names what differs: the task, observations, actions or action repeat.
@@ -218,24 +217,24 @@ def check_can_watch(name: str, spec: EnvSpec, player: EnvSpec) -> None:
     for field in EnvSpec._fields:
         own, theirs = getattr(spec, field), getattr(player, field)
         if own != theirs and field not in ("num_envs", "episode_length"):
-            remedy = f"{name} was trained with {own}; let a run of the same play"
+            remedy = f"{name} was trained with {own}; choose a player trained with the same"
             raise InvalidInput("player", f"{field} {theirs}", remedy)
 
 
 def select(episodes: Episodes, index: int) -> Episodes:
-    """One of them, with its leading dim."""
+    """One episode, with a leading dimension of 1."""
     return jax.tree.map(lambda x: x[index : index + 1], episodes)
 
 
 def windows(episodes: Episodes, row: Any, start: Any, *, length: int) -> Batch:
     """`[N, length, ...]` steps of the episodes `row`, from their steps `start` on.
 
-    The first step only gives context. What lies beyond the end of the record is its last step.
+    The first step only gives context. Beyond the end of the record, its last step is repeated.
 
     Args:
       episodes: the record.
-      row: `[N]` int, which episode.
-      start: `[N]` int, at which step the window begins.
+      row: `[N]` int, indices of episodes.
+      start: `[N]` int, first steps of the windows.
       length: steps of a window.
     """
     row, start = jnp.asarray(row), jnp.asarray(start)

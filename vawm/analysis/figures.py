@@ -1,4 +1,4 @@
-"""The numbers of this package as PNG, by matplotlib, which is imported only to draw."""
+"""Draws the numbers of this package to PNG; imports matplotlib only when drawing."""
 
 from __future__ import annotations
 
@@ -43,22 +43,22 @@ MAPS = {
 
 
 def check() -> None:
-    """Says in one line what is missing to draw.
+    """Checks that matplotlib is installed.
 
     Raises:
-      RunError: names the package and what installs it.
+      RunError: names the package and the command that installs it.
     """
     if importlib.util.find_spec("matplotlib") is None:
-        raise RunError("matplotlib is missing: pip install matplotlib (or vawm[analysis])")
+        raise RunError("matplotlib is not installed: pip install 'vawm[analysis]'")
 
 
 @contextlib.contextmanager
 def panels(
     path: pathlib.Path, rows: int, columns: int, *, size: tuple[float, float]
 ) -> Iterator[np.ndarray]:
-    """`[rows, columns]` axes of `size` inches each, saved to `path` at the end."""
+    """Yields `[rows, columns]` axes of `size` inches each, and saves them to `path`."""
     check()
-    from matplotlib.figure import Figure  # without pyplot, which has a backend of its caller's
+    from matplotlib.figure import Figure  # not pyplot, which would change the caller's backend
 
     figure = Figure(figsize=(size[0] * columns, size[1] * rows), layout="constrained")
     yield figure.subplots(rows, columns, squeeze=False)
@@ -66,9 +66,9 @@ def panels(
 
 
 def value_errors(entries: Mapping[str, Report | Group], path: pathlib.Path) -> None:
-    """Every measure by depth, a line per run or group of runs.
+    """Draws every measure by depth, with a line per run or group of runs.
 
-    Bands are standard errors, over the episodes of a run or over the runs of a group.
+    Bands are standard errors over the episodes of a run or the runs of a group.
     """
     shown = [
         measure
@@ -95,13 +95,13 @@ def value_errors(entries: Mapping[str, Report | Group], path: pathlib.Path) -> N
 
 
 def values(name: str, report: Report, path: pathlib.Path, *, rollouts: int = 12) -> None:
-    """Left: one episode over time, with values along imagined rollouts; right: all episodes."""
+    """Draws values: left, one episode over time with imagined rollouts; right, all episodes."""
     value, returns, bootstrapped = (
         np.where(report.counts, x, np.nan)
         for x in (report.value, report.returns, report.bootstrapped)
     )
     truths = {"return": (returns, "0.6")}
-    if np.nan_to_num(bootstrapped - returns).any():  # cut by a time limit
+    if np.nan_to_num(bootstrapped - returns).any():  # truncated by a time limit
         truths["bootstrapped return"] = bootstrapped, "C2"
     with panels(path, 1, 2, size=(5.6, 3.6)) as axes:
         over_time, against = axes[0]
@@ -133,13 +133,13 @@ def values(name: str, report: Report, path: pathlib.Path, *, rollouts: int = 12)
 
 
 def strip(name: str, trajectories: Trajectories, path: pathlib.Path, *, every: int = 0) -> None:
-    """Truth, imagination and difference of the first window, one column per shown step.
+    """Draws truth, imagination and difference of the first window, a column per shown step.
 
     Args:
       name: of the run.
       trajectories: with images.
       path: of the PNG.
-      every: steps from column to column; 0 for as many as fit.
+      every: steps between columns; 0 for as many columns as fit.
     """
     truth = video.side_by_side(trajectories.truth)[0]
     guess = video.side_by_side(
@@ -148,7 +148,7 @@ def strip(name: str, trajectories: Trajectories, path: pathlib.Path, *, every: i
     difference = ((guess.astype(int) - truth + 255) // 2).astype(np.uint8)
     length = max(1, int(trajectories.inside[0].sum()))
     every = every or -(-length // COLUMNS)
-    # So that the last step seen is one of the columns.
+    # Such that the last observed step is one of the columns.
     shown = range((trajectories.context - 1) % every, length, every)
     wide = truth.shape[2] / truth.shape[1]
     with panels(path, 3, len(shown), size=(1.15 * wide, 1.2)) as axes:
@@ -173,7 +173,7 @@ def _show(ax: Any, picture: np.ndarray) -> None:
 
 
 def coordinates(name: str, trajectories: Trajectories, path: pathlib.Path) -> None:
-    """Coordinates of the first window over time; of many the ones that move most."""
+    """Draws coordinates of the first window over time, at most those that vary most."""
     truth, guess = (x[0] for x in vectors(trajectories))
     inside = trajectories.inside[0]
     moving = np.argsort(-truth[inside].std(0), kind="stable")[:COORDINATES]
@@ -192,9 +192,9 @@ def coordinates(name: str, trajectories: Trajectories, path: pathlib.Path) -> No
 
 
 def saliency_images(name: str, look: Look, path: pathlib.Path) -> None:
-    """What was seen, what is decoded, and each map as heat over what was seen.
+    """Draws the observed and the decoded images, and each map as heat over the observed ones.
 
-    The colours of a map reach from 0 to its 99.5th percentile over all frames shown.
+    The colours of a map range from 0 to its 99.5th percentile over all shown frames.
     """
     seen = video.side_by_side(jax.tree.map(lambda x: x[:, None], look.truth))[:, 0]
     told = jax.tree.map(lambda x: x[:, None], look.saliency.decoded)
@@ -221,7 +221,7 @@ def saliency_images(name: str, look: Look, path: pathlib.Path) -> None:
 
 
 def heat(seen: np.ndarray, maps: np.ndarray) -> np.ndarray:
-    """`[F, H, W, 3]` uint8: `maps` `[F, H, W]` as colours over the darkened grey of `seen`."""
+    """Colours `[F, H, W, 3]` uint8 of `maps` `[F, H, W]`, over a dark grey copy of `seen`."""
     from matplotlib import colormaps
 
     top = np.quantile(maps, 0.995)
@@ -233,7 +233,7 @@ def heat(seen: np.ndarray, maps: np.ndarray) -> np.ndarray:
 
 
 def saliency_vectors(looks: Mapping[str, Look], path: pathlib.Path) -> None:
-    """Each map by coordinate, mean over the frames; a colour per run."""
+    """Draws each map by coordinate, as the mean over frames, with a colour per run."""
     with panels(path, 1, len(MAPS), size=(4.2, 3)) as axes:
         for ax, (kind, label) in zip(axes[0], MAPS.items(), strict=True):
             for number, (name, look) in enumerate(looks.items()):
@@ -248,7 +248,7 @@ def saliency_vectors(looks: Mapping[str, Look], path: pathlib.Path) -> None:
 
 
 def curves(all_curves: Curves, path: pathlib.Path) -> None:
-    """A panel per metric, a colour per group; bands from the lowest seed to the highest."""
+    """Draws a panel per metric and a colour per group; bands from lowest to highest seed."""
     shown = [metric for metric in METRICS if any(metric in own for own in all_curves.values())]
     with panels(path, 1, max(1, len(shown)), size=(3.6, 3)) as axes:
         for ax, metric in zip(axes[0], shown, strict=False):
@@ -267,7 +267,7 @@ def curves(all_curves: Curves, path: pathlib.Path) -> None:
 
 
 def _legend_below(axes: np.ndarray) -> None:
-    """Every name once, whichever panels have a line of it."""
+    """Puts one legend with the names of all panels below them."""
     named: dict[str, Any] = {}
     for ax in axes.ravel():
         handles, labels = ax.get_legend_handles_labels()

@@ -1,9 +1,9 @@
-"""The states of an episode as a world model infers them, and imagination from every one.
+"""Infers the states of an episode, and imagines from each of them.
 
-Two kinds of world models are told apart by their protocol. One that has `starts` can imagine
-from any state that it inferred: all steps of the episode but the first are one sequence. One
-that has not needs the steps before: every state is inferred from a window of `context` steps
-that ends there, so the first `context - 1` steps have none.
+The protocol distinguishes two kinds of world models. One with `starts` can imagine from any
+inferred state: all steps of the episode but the first are one sequence. One without `starts`
+needs earlier steps: each state is inferred from a window of `context` steps that ends there,
+so the first `context - 1` steps have no state.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from vawm.world_model.protocol import Imagination
 
 
 class Inferred(NamedTuple):
-    """The last N steps of a record of one episode, in order.
+    """The states of the last N steps of one recorded episode, in order.
 
     Attributes:
-      latent: `[N, ...]` s_t, its z_t drawn from the posterior.
-      post_logits: `[N, S, K]` of that posterior, before unimix; None where the protocol does
-        not give them.
-      ahead: where imagination stands after a_t: s~_{t+1}, its z drawn from the prior.
+      latent: `[N, ...]` s_t, with z_t sampled from the posterior.
+      post_logits: `[N, S, K]` of that posterior, before unimix; None if the protocol does not
+        provide them.
+      ahead: imagination after a_t: s~_{t+1}, with z sampled from the prior.
     """
 
     latent: Latent
@@ -42,13 +42,13 @@ Infer = Callable[[Params, PyTree, Key, Episodes], Inferred]
 
 
 def make_infer(agent: Agent, *, context: int, horizon: int) -> Infer:
-    """Build `infer(params, state, key, episode) -> Inferred`; `episode` has E = 1.
+    """Builds `infer(params, state, key, episode) -> Inferred`; `episode` has E = 1.
 
     No gradient is stopped here.
 
     Args:
       agent: the agent.
-      context: steps of a window, where the world model needs one; at least 2.
+      context: steps of a window, if the world model needs one; at least 2.
       horizon: steps that can be imagined after `ahead`.
     """
     world_model = agent.world_model
@@ -76,11 +76,10 @@ def make_infer(agent: Agent, *, context: int, horizon: int) -> Infer:
 
 
 def make_prior(agent: Agent) -> Callable[..., Array] | None:
-    """Build `prior(params, state, key, latent, action) -> logits [N, S, K]`, before unimix.
+    """Builds `prior(params, state, key, latent, action) -> logits [N, S, K]`, before unimix.
 
-    They are of p(z_{t+1} | h_{t+1}) after `latent` and `action`: those by which `explain` would
-    judge a sequence that begins with this state. None for a world model whose states are not
-    all that it needs.
+    The logits of p(z_{t+1} | h_{t+1}) after `latent` and `action`, as `explain` computes them
+    for a sequence that starts with this state. None for a world model without `starts`.
     """
     world_model, spec = agent.world_model, agent.spec
     if world_model.starts is None:
@@ -94,7 +93,7 @@ def make_prior(agent: Agent) -> Callable[..., Array] | None:
 
         flag = jnp.zeros((size, 2), bool)
         steps = Trajectory(
-            obs=jax.tree.map(blank, spec.obs),  # the prior never sees it
+            obs=jax.tree.map(blank, spec.obs),  # the prior does not depend on it
             reward=jnp.zeros((size, 2)),
             is_first=flag,
             is_last=flag,
@@ -109,7 +108,7 @@ def make_prior(agent: Agent) -> Callable[..., Array] | None:
 
 
 def check(config: Config, *, context: int, depth: int) -> None:
-    """Refuses what no world model, or not this one, can imagine.
+    """Refuses a context and a depth that the world model cannot imagine with.
 
     Raises:
       InvalidInput: names the number and the remedy.
@@ -117,11 +116,11 @@ def check(config: Config, *, context: int, depth: int) -> None:
     check_positive("depth", depth)
     check_positive("context", context)
     if context < 2:
-        raise InvalidInput("context", context, "use at least 2: the first step infers nothing")
+        raise InvalidInput("context", context, "use at least 2: the first step has no state")
     seen = config.replay.batch_length
     if not registry.kind(config.agent).context_limited or context + depth <= seen:
         return
-    saw = f"training saw {seen} positions"
+    saw = f"training used {seen} positions"
     if context >= seen:
         raise InvalidInput("context", context, f"use less than {seen}: {saw}")
     raise InvalidInput("depth", depth, f"use at most {seen - context} after the context: {saw}")

@@ -1,4 +1,4 @@
-"""Frames as MP4, by imageio and the ffmpeg that comes with it."""
+"""Writes frames to MP4, with imageio and its ffmpeg."""
 
 from __future__ import annotations
 
@@ -15,16 +15,14 @@ PACKAGES = {"imageio": "imageio", "imageio_ffmpeg": "imageio-ffmpeg"}
 
 
 def check() -> None:
-    """Says in one line what is missing to write a film.
+    """Checks that the packages for films are installed.
 
     Raises:
-      RunError: names the package and what installs it.
+      RunError: names the package and the command that installs it.
     """
     for module, package in PACKAGES.items():
         if importlib.util.find_spec(module) is None:
-            raise RunError(
-                f"{package} is missing: pip install imageio[ffmpeg] (or vawm[analysis])"
-            )
+            raise RunError(f"{package} is not installed: pip install 'vawm[analysis]'")
 
 
 def write_mp4(
@@ -34,12 +32,12 @@ def write_mp4(
     per_second: int = FRAMES_PER_SECOND,
     enlarge: int = 3,
 ) -> None:
-    """H.264 of `[T, H, W, 3]` uint8 frames, every pixel a square of `enlarge` pixels.
+    """Writes `[T, H, W, 3]` uint8 frames as H.264, each pixel as `enlarge` x `enlarge` pixels.
 
-    Odd sides get one more row or column of the last one's colour, since the codec halves them.
+    Odd sides are padded by repeating the last row or column, because the codec needs even ones.
 
     Raises:
-      RunError: a package is missing.
+      RunError: a package is not installed.
       OSError: the file could not be written.
     """
     check()
@@ -49,7 +47,7 @@ def write_mp4(
     odd = [(0, size % 2) for size in large.shape[1:3]]
     even = np.pad(large, [(0, 0), *odd, (0, 0)], mode="edge")
     with warnings.catch_warnings():
-        # JAX warns of every fork; this one runs ffmpeg at once and touches nothing of JAX.
+        # JAX warns of every fork; this one only starts ffmpeg and does not use JAX.
         warnings.filterwarnings("ignore", message=r"os\.fork\(\)", category=RuntimeWarning)
         imageio.imwrite(
             path,

@@ -1,25 +1,25 @@
-"""Which part of an observation a latent, and the value of it, depends on: Figs 3 and 13.
+"""Saliency: the parts of an observation that a latent and its value depend on; Figs 3 and 13.
 
-Three maps of the shape of the observation, at an inferred state s = (h, z):
+Three maps with the shape of the observation, at an inferred state s = (h, z):
 
-    sensitivity      sqrt(sum_j (d o_i / d z_j)^2)        how strongly o_i moves with z
-    value            |sum_j d o_i / d z_j * dV / d z_j|   how o_i moves where V rises
-    observed         |dV / d x_i|                         what of the input V depends on
+    sensitivity      sqrt(sum_j (d o_i / d z_j)^2)        how strongly o_i changes with z
+    value            |sum_j d o_i / d z_j * dV / d z_j|   how o_i changes as V rises
+    observed         |dV / d x_i|                         how V depends on the input x_i
 
-o is the decoded observation at (h, z), x the observation that z was inferred from. The paper
-calls the second one value-gradient weighting and gives no formula: pulling dV/dz back through
-the decoder's sensitivity is our reading.
+o is the decoded observation at (h, z), and x the observation that z was inferred from. The
+paper calls the second map value-gradient weighting and gives no formula: we push dV/dz
+through the decoder's Jacobian.
 
-For the first two, decoder and critic are differentiated at the drawn one-hot z as if it were
-any vector, h held fixed, along directions that keep the sum of each categorical: J and dV/dz
-are centred there, so a decoder or a critic that ignores z has empty maps. The third goes
-through encoder and posterior of the last step, and through the draw of z by the
-straight-through gradient, that of the probabilities; h does not depend on x. Where z is not
-drawn, it is the gradient itself.
+For the first two maps, decoder and critic are differentiated at the sampled one-hot z as if it
+were any vector, with h fixed, along directions that keep the sum of each categorical. J and
+dV/dz are centred accordingly, so a decoder or a critic that ignores z has empty maps. The third
+map differentiates through encoder and posterior of the last step, and through the sample of z
+by the straight-through gradient of the probabilities; h does not depend on x. If z is not
+sampled, it is the exact gradient.
 
-V is the critic's mean, or symlog of it. Images are in [0, 1], decoded vectors in
-symlog. Of the colours of a pixel a map holds the Euclidean norm, which for a single one is the
-absolute value.
+V is the critic's mean, or its symlog. Images are in [0, 1], decoded vectors in symlog. A map
+has one number per pixel, the Euclidean norm over its colours (the absolute value if there is
+only one).
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ MAPS = ("sensitivity", "value", "observed")
 class Saliency(NamedTuple):
     """Maps of F states; every field but the last has the tree of an observation.
 
-    Images have `[F, H, W]`, vectors `[F, D]`, and `decoded` is as the decoder tells it.
+    Maps of images are `[F, H, W]`, of vectors `[F, D]`; `decoded` is the decoder's output.
     """
 
     decoded: PyTree
@@ -61,14 +61,14 @@ class Saliency(NamedTuple):
 def make_saliency(
     agent: Agent, *, unit: Unit = "symlog", probes: int = 128
 ) -> Callable[[Params, PyTree, Key, Batch], Saliency]:
-    """Build `saliency(params, state, key, batch) -> Saliency`, of the last step of each row.
+    """Builds `saliency(params, state, key, batch) -> Saliency`, of the last step of each row.
 
     Args:
       agent: the agent.
       unit: of V.
-      probes: random signs v by which the squared sensitivity is estimated, as the mean of
-        (J v)^2, J = d o / d z; unbiased, with a relative standard error of at most
-        sqrt(2 / probes) for each entry. No Jacobian is built.
+      probes: number of random sign vectors v that estimate the squared sensitivity as the
+        mean of (J v)^2, with J = d o / d z. Unbiased, with a relative standard error of at
+        most sqrt(2 / probes) per entry. No Jacobian is built.
     """
     world_model, critic = agent.world_model, agent.critic
 
@@ -81,7 +81,7 @@ def make_saliency(
         model = params.world_model
 
         def infer(obs: PyTree) -> Latent:
-            """The state after the last step, had `obs` been seen there."""
+            """The state after the last step, with `obs` as its observation."""
             joined = jax.tree.map(
                 lambda past, last: jnp.concatenate([past[:, :-1], last[:, None]], axis=1),
                 batch.trajectory.obs,
@@ -105,7 +105,7 @@ def make_saliency(
             sign = jax.random.rademacher(key, stoch.shape, stoch.dtype)
             return jax.tree.map(lambda t, x: t + jnp.square(x), total, push(sign)), None
 
-        # Rows do not meet in any network, so the gradient of the sum is that of each.
+        # No network mixes rows, so the gradient of the sum contains that of each row.
         slope = jax.grad(lambda z: value(params, Latent(deter, on_simplex(z))).sum())(stoch)
         decoded, push = forward(decode, stoch)
         zero = jax.tree.map(jnp.zeros_like, decoded)
@@ -124,10 +124,10 @@ def make_saliency(
 def forward(
     function: Callable[[Array], PyTree], x: Array
 ) -> tuple[PyTree, Callable[[Array], PyTree]]:
-    """`function(x)`, and its derivative there along a direction: v -> J v.
+    """`function(x)`, and its directional derivative there, v -> J v.
 
-    By transposing u -> J^T u, which is linear in u: some convolutions know their reverse
-    derivative only.
+    Transposes u -> J^T u, which is linear in u, because some convolutions only define their
+    reverse derivative.
     """
     y, pull = jax.vjp(function, x)
     _, push = jax.vjp(lambda u: pull(u)[0], jax.tree.map(jnp.zeros_like, y))
@@ -137,10 +137,10 @@ def forward(
 def gradient(
     function: Callable[[PyTree], tuple[Array, PyTree]], obs: PyTree
 ) -> tuple[PyTree, PyTree]:
-    """Of the scalar that `function` returns first, and what it returns second.
+    """The gradient of the scalar that `function` returns first, and its second output.
 
-    Bytes have no gradient: `function` gets pixels as floats from 0 to 255, and is
-    differentiated by a 255th of them, in [0, 1] like what is decoded.
+    uint8 has no gradient: `function` gets pixels as floats from 0 to 255, and the gradient is
+    with respect to pixels in [0, 1], the decoder's unit.
     """
     units = jax.tree.map(lambda x: 255.0 if is_image(x) else 1.0, obs)
 
@@ -160,11 +160,11 @@ def norms(changes: PyTree, obs: PyTree) -> PyTree:
 
 
 class Look(NamedTuple):
-    """F states of one episode, numpy.
+    """The saliency of F states of one episode; numpy.
 
     Attributes:
-      step: `[F]` of the episode.
-      truth: what was observed there, `[F, ...]`.
+      step: `[F]` steps of the episode.
+      truth: observations there, `[F, ...]`.
       saliency: of these states.
       unit: of V.
     """
@@ -184,10 +184,10 @@ def look(
     seed: int,
     unit: Unit = "symlog",
 ) -> Look:
-    """Maps of `frames` states, evenly spaced over the first episode.
+    """Computes maps of `frames` states, evenly spaced over the first episode.
 
-    Every state is inferred from the `context` steps that end there, the first of which only
-    gives context; so the first state has `context` steps.
+    Every state is inferred from the `context` steps that end there; the first of these only
+    gives context. So the first state is at step `context - 1`.
 
     Raises:
       InvalidInput: an impossible number, or an episode shorter than the context.
@@ -196,7 +196,7 @@ def look(
     check_positive("frames", frames)
     length = int(np.asarray(episodes.length)[0])
     if length < context:
-        remedy = f"the first episode has {length} steps; use at most that"
+        remedy = f"use at most {length}, the steps of the first episode"
         raise InvalidInput("context", context, remedy)
     step = np.unique(np.linspace(context - 1, length - 1, frames).round().astype(int))
     batch = windows(episodes, np.zeros_like(step), step - (context - 1), length=context)
@@ -209,14 +209,14 @@ def look(
 
 
 def images(like: PyTree, maps: PyTree) -> np.ndarray | None:
-    """The maps of all images side by side, `[F, H, W]`; None where there are none."""
+    """The maps of all images side by side, `[F, H, W]`; None if there are none."""
     pairs = zip(jax.tree.leaves(like), _leaves(maps), strict=True)
     found = [x for truth, x in pairs if is_image(truth) and x is not None]
     return np.concatenate(found, -1) if found else None
 
 
 def coordinates(like: PyTree, maps: PyTree) -> np.ndarray | None:
-    """The maps of all vectors, one after the other, `[F, D]`; None where there are none."""
+    """The maps of all vectors, concatenated, `[F, D]`; None if there are none."""
     pairs = zip(jax.tree.leaves(like), _leaves(maps), strict=True)
     found = [x for truth, x in pairs if not is_image(truth) and x is not None]
     return np.concatenate(found, -1) if found else None
@@ -227,9 +227,9 @@ def _leaves(maps: PyTree) -> list[Any]:
 
 
 def concentration(maps: np.ndarray) -> float:
-    """Share of a map's sum that its strongest tenth of entries has, mean over `[F, ...]`.
+    """Share of a map's sum in its strongest tenth of entries, mean over `[F, ...]`.
 
-    0.1 for an even map, 1 where a tenth has everything; NaN where all maps are 0.
+    0.1 for a uniform map, 1 if one tenth has everything, NaN if all maps are 0.
     """
     flat = np.sort(np.asarray(maps, np.float64).reshape(len(maps), -1), axis=1)[:, ::-1]
     total = flat.sum(1)
@@ -239,7 +239,7 @@ def concentration(maps: np.ndarray) -> float:
 
 
 def rows(name: str, look: Look) -> list[dict[str, Any]]:
-    """For a CSV: images by how concentrated a map is, vectors coordinate by coordinate."""
+    """Rows for a CSV: the concentration of maps of images, and vectors by coordinate."""
     result = []
     for kind in MAPS:
         maps = getattr(look.saliency, kind)

@@ -1,4 +1,4 @@
-"""Numbers on disk: CSV for rows, JSON for what a program measured once."""
+"""Writes numbers to disk: CSV for rows, JSON for single values."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from vawm.runs.reports.tracking import as_json
 
 
 def write_csv(rows: Sequence[Mapping[str, Any]], path: pathlib.Path) -> None:
-    """A column for every key of the first row; what is not finite is left empty.
+    """Writes a column for every key of the first row; numbers that are not finite are empty.
 
-    Of no rows a single empty line is written: their columns are not known.
+    Without rows it writes one empty line, because the columns are unknown.
     """
     with path.open("w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]) if rows else [], lineterminator="\n")
@@ -24,7 +24,7 @@ def write_csv(rows: Sequence[Mapping[str, Any]], path: pathlib.Path) -> None:
 
 
 def write_json(values: Mapping[str, Any], path: pathlib.Path) -> None:
-    """Strictly valid JSON of one level or two: what is not finite becomes null."""
+    """Writes strictly valid JSON, at most two levels deep; non-finite numbers become null."""
     path.write_text(json.dumps({k: _strict(v) for k, v in values.items()}, indent=2) + "\n")
 
 

@@ -1,7 +1,7 @@
 """Imagined trajectories against the truth, Figs 3 and 7.
 
-After a context that is observed, the recorded actions are followed open loop: the world model
-never looks again, and its decoder tells what it expects.
+After an observed context, the world model follows the recorded actions open loop, without
+further observations; its decoder predicts them.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ class Trajectories(NamedTuple):
     """R windows of T steps, `context` of them observed; numpy.
 
     Attributes:
-      start: `[R]` the step of its episode that each window begins with.
-      truth: as observed, `[R, T, ...]`.
-      predicted: as decoded: symlog for vectors, [0, 1] for images.
-      inside: `[R, T]` bool, whether the step is one of the episode.
-      context: steps that were observed.
+      start: `[R]` the step of the episode at which each window starts.
+      truth: observations, `[R, T, ...]`.
+      predicted: the decoder's output: symlog for vectors, [0, 1] for images.
+      inside: `[R, T]` bool, whether the step is inside the episode.
+      context: number of observed steps.
     """
 
     start: np.ndarray
@@ -48,14 +48,14 @@ def imagine(
     seed: int,
     at_most: int = 4,
 ) -> Trajectories:
-    """Windows of `context + depth` steps, one from each of the first `at_most` episodes.
+    """Imagines windows of `context + depth` steps, one in each of the first `at_most` episodes.
 
-    Where in its episode a window lies is drawn by `seed`, among the places where it fits; in an
-    episode shorter than that it begins with the first step. The step before the window gives
-    context only, as in every `Batch`.
+    `seed` draws the position of a window among those where it fits; in a shorter episode it
+    starts at the first step. The step before the window only gives context, as in every
+    `Batch`.
 
     Raises:
-      InvalidInput: a depth or a context that cannot be imagined, see `inference.check`.
+      InvalidInput: an impossible depth or context, see `inference.check`.
     """
     inference.check(policy.config, context=context, depth=depth)
     agent = make_agent(policy.config, policy.spec)
@@ -76,10 +76,10 @@ def imagine(
 
 
 def errors(trajectories: Trajectories) -> dict[str, np.ndarray]:
-    """Mean squared error by step, "image" and "vector", each `[T]` where there are such.
+    """Mean squared error by step, `[T]`, of "image" and "vector", if there are any.
 
-    In the decoder's units, over pixels or coordinates of the windows that are still inside of
-    their episode; NaN where none is.
+    In the decoder's units, over pixels or coordinates of the windows that are still inside
+    their episode; NaN if none is.
     """
     kinds: dict[str, list[np.ndarray]] = {}
     pairs = zip(
@@ -105,7 +105,7 @@ def errors(trajectories: Trajectories) -> dict[str, np.ndarray]:
 
 
 def rows(name: str, trajectories: Trajectories) -> list[dict[str, Any]]:
-    """For a CSV: one row per step; steps that were observed have a depth of 0 and below."""
+    """Rows for a CSV, one per step; observed steps have a depth of 0 or less."""
     return [
         {
             "run": name,
@@ -120,9 +120,9 @@ def rows(name: str, trajectories: Trajectories) -> list[dict[str, Any]]:
 
 
 def film(trajectories: Trajectories) -> np.ndarray:
-    """`[T, H, W, 3]` uint8: truth, imagination and difference one above the other.
+    """Frames `[T, H, W, 3]` uint8: truth, imagination and difference, one above the other.
 
-    Windows lie side by side; the border is that of `video.open_loop_video`.
+    Windows are side by side; the border is that of `video.open_loop_video`.
     """
     shown = video.open_loop_video(
         trajectories.truth,
@@ -134,7 +134,7 @@ def film(trajectories: Trajectories) -> np.ndarray:
 
 
 def vectors(trajectories: Trajectories) -> tuple[np.ndarray, np.ndarray]:
-    """Truth and prediction of all coordinates in the units of `symlog`, both `[R, T, D]`."""
+    """Truth and prediction of all coordinates in symlog, both `[R, T, D]`."""
     pairs = [
         (np.asarray(symlog(truth)), np.asarray(guess))
         for truth, guess in zip(

@@ -1,32 +1,32 @@
 """Value errors by depth of imagination: how far imagined states mislead the critic.
 
-From every state s_t that was inferred in a recorded episode, the world model imagines along the
-recorded actions, k = 0..K steps, with its prior. What is read from s~_{t+k} is compared with
-what is read from the inferred s_{t+k}, and with what truly happened:
+From every inferred state s_t of a recorded episode, the world model imagines k = 0..K steps
+along the recorded actions, with its prior. Predictions from s~_{t+k} are compared with
+those from the inferred s_{t+k}, and with the recorded rewards:
 
     value        |V(s~_{t+k}) - V(s_{t+k})|
     return       |V(s~_{t+k}) - G_{t+k}|,  G_t = sum_{i >= 1} gamma^{i-1} r_{t+i}
-    bootstrapped the same, with gamma^{T-t} V(s_T) added to G_t where s_T is not terminal
+    bootstrapped the same, with gamma^{T-t} V(s_T) added to G_t if s_T is not terminal
     reward       |R(s~_{t+k}) - r_{t+k}|, R the mean of the reward head
     value_kl     KL[V(s_{t+k}) || V(s~_{t+k})] in nats, of the critic's distributions
     latent_kl    KL[q(z_{t+k} | h_{t+k}, o_{t+k}) || p(z | h~_{t+k})] in nats, summed over the
                  categoricals, with unimix
-    distance     half of |z~ - z|^2, mean over the categoricals: for one-hot z the share of them
-                 that differ
+    distance     half of |z~ - z|^2, mean over the categoricals: for one-hot z, the share of
+                 categoricals that differ
 
-At depth 0 the imagined state is the inferred one. Only depths inside the same episode count,
-for the returns only states that an action left from, T being the step of the last. V is the
-online critic's mean, in units of the reward. An episode cut by a time limit misses what would
-have come: "return" leaves that out of G, "bootstrapped" takes the critic's word for it.
+At depth 0 the imagined state is the inferred one. Only depths inside the same episode count;
+for the returns, only states with an action (all but the last step T). V is the online critic's
+mean, in units of the reward. If a time limit truncates an episode, "return" leaves the missing
+rewards out of G; "bootstrapped" replaces them by the critic's estimate.
 
 A critic whose values hardly differ has small errors whatever its world model does. So the
-first three are also told relative to the run's own values:
+first three errors are also given relative to the values of the run:
 
     relative_value, relative_return, relative_bootstrapped    the error / spread
-    spread    standard deviation (that of a population) of V(s_t) over the inferred states s_t
-              that an action left from, those of all episodes that are judged taken together
+    spread    standard deviation (of the population) of V(s_t) over the inferred states s_t with
+              an action, pooled over all episodes
 
-Where the spread is 0 they are NaN. Standard errors take the spread for granted.
+If the spread is 0 they are NaN. Standard errors treat the spread as exact.
 
 Source: our reading of Figs 3 and 7, which show imagined trajectories as pictures.
 """
@@ -51,22 +51,22 @@ from vawm.types import Array, Key, Latent, Params, PyTree
 
 
 class Rollouts(NamedTuple):
-    """What imagination says, `[N, K + 1]`: entry (i, k) is k steps after the i-th state."""
+    """Results of imagination, `[N, K + 1]`: entry (i, k) is k steps after the i-th state."""
 
-    value: Any  # of jax or of numpy, like the others
+    value: Any  # a jax or numpy array, like the others
     reward: Any
     value_kl: Any
-    latent_kl: Any  # NaN where the world model's protocol does not give logits
+    latent_kl: Any  # NaN if the world model's protocol does not provide logits
     distance: Any
 
 
 def make_rollouts(
     agent: Agent, config: Config, *, context: int, depth: int
 ) -> Callable[[Params, PyTree, Key, Episodes], Rollouts]:
-    """Build `rollouts(params, state, key, episode) -> Rollouts`; `episode` has E = 1.
+    """Builds `rollouts(params, state, key, episode) -> Rollouts`; `episode` has E = 1.
 
-    The N states are the last N steps of the record; depths beyond it repeat its last step and
-    mean nothing. No gradient is stopped.
+    The N states are the last N steps of the record. Depths beyond its end repeat its last step
+    and are meaningless. No gradient is stopped.
     """
     world_model, critic = agent.world_model, agent.critic
     infer = make_infer(agent, context=context, horizon=depth)
@@ -136,7 +136,7 @@ def make_rollouts(
 
 
 RELATIVE = {f"relative_{name}": name for name in ("value", "return", "bootstrapped")}
-"""Measures that are another one divided by the spread of the run's values."""
+"""Relative measure -> the measure that is divided by the spread of the run's values."""
 MEASURES = (
     "value",
     "return",
@@ -150,12 +150,12 @@ MEASURES = (
 
 
 class ErrorByDepth(NamedTuple):
-    """Errors of E units at depths 0..K: of the episodes of a run, or of the runs of a group.
+    """Errors of E units at depths 0..K; units are the episodes of a run or the runs of a group.
 
     Attributes:
-      states: measure -> `[E, K + 1]` states of the unit that reach so deep within an episode.
-      errors: measure -> `[E, K + 1]`, the unit's mean; NaN where it has none.
-      units: what E counts, and standard errors are over.
+      states: measure -> `[E, K + 1]` number of states that reach this depth in an episode.
+      errors: measure -> `[E, K + 1]`, mean of the unit; NaN if it has none.
+      units: the units that E counts and that standard errors are over.
     """
 
     states: dict[str, np.ndarray]
@@ -163,30 +163,30 @@ class ErrorByDepth(NamedTuple):
     units: Literal["episodes", "runs"] = "episodes"
 
     def mean(self, measure: str) -> np.ndarray:
-        """`[K + 1]` over the units that have an error so deep; NaN where none has."""
+        """`[K + 1]` mean over the units with an error at this depth; NaN if there is none."""
         return mean_and_error(self.errors[measure])[0]
 
     def standard_error(self, measure: str) -> np.ndarray:
-        """`[K + 1]` of `mean`; NaN below two units."""
+        """`[K + 1]` standard error of `mean`; NaN for fewer than two units."""
         return mean_and_error(self.errors[measure])[1]
 
     def number(self, measure: str) -> np.ndarray:
-        """`[K + 1]` of units that `mean` is over."""
+        """`[K + 1]` number of units that `mean` is over."""
         return (~np.isnan(self.errors[measure])).sum(0)
 
 
 class Report(NamedTuple):
-    """Of one run.
+    """The value errors of one run.
 
     Attributes:
       by_depth: the errors.
-      first: the step of an episode that the first state inferred belongs to.
+      first: the step of an episode of the first inferred state.
       value: `[E, N]` V of the inferred states s_first, s_{first + 1}, ...
       imagined: `[E, N, K + 1]` values along imagined rollouts.
-      returns: `[E, N]` G there.
-      bootstrapped: `[E, N]` the same with what the critic says of the last state.
-      counts: `[E, N]` bool, whether an action left from there.
-      spread: standard deviation of V where that is so.
+      returns: `[E, N]` G of these states.
+      bootstrapped: `[E, N]` the same, plus the critic's value of the last state.
+      counts: `[E, N]` bool, whether the state has an action.
+      spread: standard deviation of V over the states with an action.
     """
 
     by_depth: ErrorByDepth
@@ -200,10 +200,10 @@ class Report(NamedTuple):
 
 
 class Group(NamedTuple):
-    """Of runs that differ in nothing but their seed.
+    """The value errors of runs that differ only in their seed.
 
     Attributes:
-      by_depth: a row for each run, its mean over its episodes.
+      by_depth: a row per run, its mean over its episodes.
       spread: mean over the runs.
     """
 
@@ -214,10 +214,10 @@ class Group(NamedTuple):
 def report(
     policy: Policy, episodes: Episodes, *, context: int, depth: int, seed: int
 ) -> Report:
-    """Rolls every episode out and compares; one compiled program for all of them.
+    """Imagines along every episode and compares; one compiled function for all of them.
 
     Raises:
-      InvalidInput: a depth or a context that cannot be imagined, see `inference.check`.
+      InvalidInput: an impossible depth or context, see `inference.check`.
     """
     check(policy.config, context=context, depth=depth)
     agent = make_agent(policy.config, policy.spec)
@@ -235,9 +235,9 @@ def report(
 
 
 def compare(rollouts: Rollouts, episodes: Episodes, *, discount: float) -> Report:
-    """What the rollouts `[E, N, K + 1]` of the last N steps of a record are worth.
+    """Computes the errors of rollouts `[E, N, K + 1]` of the last N steps of a record.
 
-    Plain numpy in float64; the equations are those of the module.
+    Plain numpy in float64; the module's docstring has the equations.
     """
     steps, length = episodes.trajectory, np.asarray(episodes.length)
     _, count, depths = rollouts.value.shape
@@ -283,7 +283,7 @@ def compare(rollouts: Rollouts, episodes: Episodes, *, discount: float) -> Repor
 
 
 def spread_of(values: np.ndarray) -> float:
-    """Standard deviation; 0 where the values are no further apart than float32 rounds them."""
+    """Standard deviation; 0 if the values differ by no more than float32 rounding."""
     values = np.asarray(values, np.float64)
     if not values.size:
         return 0.0
@@ -292,23 +292,23 @@ def spread_of(values: np.ndarray) -> float:
 
 
 def relative(errors: np.ndarray, spread: float) -> np.ndarray:
-    """Errors in units of the spread; NaN where that is 0."""
+    """Errors in units of the spread; NaN if the spread is 0."""
     return errors / spread if spread else np.full_like(errors, np.nan)
 
 
 def pooled(
     reports: Mapping[str, Report], groups: Mapping[str, Sequence[str]]
 ) -> dict[str, Report | Group]:
-    """One entry per group: of several runs what they are together, of a single one its report.
+    """One entry per group: a `Group` for several runs, the `Report` for a single one.
 
     A run whose relative errors are NaN is left out of those of its group, and not counted.
 
     Args:
       reports: by name of the run.
-      groups: names of the runs of each, by what these have in common.
+      groups: name of the group -> names of its runs.
 
     Returns:
-      the reports of single runs by the run's name, groups by theirs and the number of runs.
+      Reports of single runs under the run's name; groups under their name and number of runs.
     """
     entries: dict[str, Report | Group] = {}
     for group, names in groups.items():
@@ -321,7 +321,7 @@ def pooled(
 
 
 def pool(reports: Sequence[Report]) -> Group:
-    """Runs that are the units of one error by depth."""
+    """Pools runs: they are the units of one error by depth."""
     of_runs = [run.by_depth for run in reports]
     return Group(
         ErrorByDepth(
@@ -339,9 +339,9 @@ def discounted_returns(
     """G_t = r_{t+1} + gamma G_{t+1} up to the last step T, where G_T = `tail`; float64.
 
     Args:
-      reward: `[E, T]` by arrival: r_t came with o_t.
+      reward: `[E, T]` by arrival: r_t arrives with o_t.
       length: `[E]` steps of each episode; G is 0 beyond.
-      tail: `[E]`.
+      tail: `[E]` the return of the last step, G_T.
       discount: gamma.
     """
     reward = np.asarray(reward, np.float64)
@@ -354,7 +354,7 @@ def discounted_returns(
 
 
 def mean_over(error: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """`[E, N, K]` -> `[E, K]` over what the mask holds; NaN where that is nothing."""
+    """`[E, N, K]` -> `[E, K]` mean over the entries in the mask; NaN if there are none."""
     total, count = np.where(mask, error, 0.0).sum(1), mask.sum(1)
     return np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
 
@@ -370,7 +370,7 @@ def mean_and_error(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def rows(name: str, entry: Report | Group) -> list[dict[str, Any]]:
-    """For a CSV: one row per depth and measure.
+    """Rows for a CSV, one per depth and measure.
 
     The mean and its standard error are `over` episodes or runs, `count` of them.
     """
@@ -400,7 +400,7 @@ SHOWN = ("value", "return", "relative_value", "relative_return")
 
 
 def table(entries: Mapping[str, Report | Group], *, measures: tuple[str, ...] = SHOWN) -> str:
-    """A few depths of a few measures for people to read: mean +- standard error."""
+    """A few depths of a few measures as text: mean +- standard error."""
     wide = max(map(len, entries))
     lines = []
     for measure in measures:
@@ -411,6 +411,6 @@ def table(entries: Mapping[str, Report | Group], *, measures: tuple[str, ...] = 
             shown = sorted({0, 1, deepest // 4, deepest // 2, deepest})
             cells = [f"{k}: {mean[k]:.3g} +- {error[k]:.2g}" for k in shown]
             lines.append(f"  {name:{wide}}   " + "   ".join(cells))
-    lines.append("spread of V, which relative errors are relative to")
+    lines.append("spread of V (relative errors = errors / spread)")
     lines += [f"  {name:{wide}}   {entry.spread:.3g}" for name, entry in entries.items()]
     return "\n".join(lines)

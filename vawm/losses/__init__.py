@@ -1,17 +1,18 @@
-"""The losses, arrays in and arrays out: no network, environment or configuration.
+"""Losses as functions of arrays, without networks, environments or configuration.
 
-Losses are per element, and masks, weights and means are the caller's, but where a definition
-has them itself: `batch_dynamics_loss`, those along an unrolled model, and TEMPO. Those that
-need derivatives of a model or a critic take it as a function. Equation numbers are the paper's.
+Losses are per element; the caller applies masks, weights and means. Exceptions, where they are
+part of the definition: `batch_dynamics_loss`, losses along an unrolled model, and TEMPO. Losses
+that need derivatives of a model or a critic take it as a function. Equation numbers are the
+paper's.
 
-    prediction_loss, symlog_mse, image_mse, continue_loss     Eq. 3a  what the heads predict
+    prediction_loss, symlog_mse, image_mse, continue_loss     Eq. 3a  predictions of the heads
     dynamics_loss, batch_dynamics_loss, balanced_kl           Eq. 3b  prior and posterior
     value_alignment_loss                                      Eq. 4   values under both
     value_alignment_weight                                    Eq. 5   its adaptive weight
-    critic_loss                                               Eq. 7   towards lambda-returns
+    critic_loss                                               Eq. 7   lambda-returns
     actor_loss, discount_weights                              Eq. 8   policy gradient
 
-What they are made of, from `vawm.losses.returns` and `vawm.losses.transforms`:
+Their parts, from `vawm.losses.returns` and `vawm.losses.transforms`:
 
     lambda_returns, replay_returns                            Eq. 7   targets of the critic
     ReturnScale, init_return_scale, update_return_scale, return_scale
@@ -20,23 +21,23 @@ What they are made of, from `vawm.losses.returns` and `vawm.losses.transforms`:
 
 The value-aware family:
 
-    vaml_loss                               VAML      the critic that is furthest off
+    vaml_loss                               VAML      error of the worst critic
     iter_vaml_loss                          IterVAML  squared error of the mean value
     categorical_iter_vaml_loss              MAD-TD    cross-entropy of value distributions
-    cvaml_loss                              CVAML     squared error without its samples' bias
+    cvaml_loss                              CVAML     squared error without sampling bias
     vagram_loss                             VaGraM    errors weighted by the value's gradient
-    vagram_taylor_loss                                the first order that it bounds
-    vagram_second_order_loss, vagram_joint_loss       and with the value's curvature
-    lambda_ac_loss, latent_consistency_loss lambda-AC IterVAML of several steps in latents
+    vagram_taylor_loss                                the first-order error that it bounds
+    vagram_second_order_loss, vagram_joint_loss       with the value's curvature
+    lambda_ac_loss, latent_consistency_loss lambda-AC IterVAML over several steps in latents
     muzero_value_loss, n_step_returns, scale_gradient
-                                            MuZero    model and critic towards returns
-    tempo_meta_gradient                     TEMPO     weights of samples of a likelihood
+                                            MuZero    model and critic, towards returns
+    tempo_meta_gradient                     TEMPO     weights of the samples of a likelihood
 
-The critic is the caller's to stop, except for `muzero_value_loss`, which trains it, and
-`tempo_meta_gradient`, which differentiates by the weights alone.
+The caller stops the critic's parameters, except for `muzero_value_loss`, which trains the
+critic, and `tempo_meta_gradient`, which differentiates only with respect to the weights.
 
-What docstrings cite. Equation numbers are those of the paper that this package is about; of
-what is listed here equations are as we know them, not as printed there.
+References. Equation numbers are those of the value-alignment paper; equations of the methods
+below are in our notation, not as printed there.
 
     Farahmand et al., 2017      Value-Aware Loss Function for Model-based Reinforcement Learning
     Farahmand, 2018             Iterative Value-Aware Model Learning

@@ -1,4 +1,4 @@
-"""Learning behaviour in imagination: critic towards returns, actor towards advantage."""
+"""Losses of behaviour in imagination: the critic's and the actor's."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ def critic_loss(
 
         L = CE(V(s), twohot(R)) + slow_scale * CE(V(s), twohot(y_slow))
 
-    In the official DreamerV3 y_slow is the slow critic's mean, encoded again; in the official
-    STORM it is the lambda-return of the slow critic's values.
+    In the official DreamerV3, y_slow is the slow critic's mean (encoded again as two-hot); in
+    the official STORM, it is the lambda-return of the slow critic's values.
 
     Args:
       value_logits: `[..., bins]` critic logits at s_t.
       slow_target: `[...]` y_slow, in the units of `bins`.
       returns: `[...]` lambda-returns R_t, in the units of `bins`, not normalised.
-      bins: `[bins]` of the critic: of values, or of their symlogs.
+      bins: `[bins]` of the critic, values or their symlogs.
       slow_scale: weight of the second target.
 
     Returns:
@@ -46,19 +46,19 @@ def critic_loss(
 def actor_loss(
     log_prob: Array, entropy: Array, advantage: Array, *, entropy_scale: float
 ) -> Array:
-    """REINFORCE with an entropy bonus, Eq. 8, for discrete and continuous actions alike.
+    """REINFORCE with an entropy bonus, Eq. 8, for discrete and continuous actions.
 
         L = -(sg(A) * log pi(a | s) + entropy_scale * H[pi(. | s)])
 
     Args:
       log_prob: `[...]` of the imagined action in nats, summed over action dims.
       entropy: `[...]` of the policy at the same state in nats, summed over action dims.
-      advantage: `[...]` A = (R_t - v_t) / S, without unit: S is the scale of Eq. 9.
+      advantage: `[...]` A = (R_t - v_t) / S, unitless; S is the scale of Eq. 9.
       entropy_scale: weight of the bonus.
 
     Returns:
-      `[...]` losses. The advantage is stopped; the action is the caller's to stop, or a
-      reparametrised one sends gradients through log_prob.
+      `[...]` losses. The advantage is stopped. The caller stops the action; otherwise a
+      reparametrised action sends gradients through log_prob.
 
     Raises:
       AssertionError: the shapes differ.
@@ -68,13 +68,13 @@ def actor_loss(
 
 
 def discount_weights(cont: Array) -> Array:
-    """Probability that each imagined state is reached, discounted.
+    """Discounted probability of reaching each imagined state.
 
         w_t = prod_{i<=t} c_i
 
-    Weights of the losses of Eq. 7 and 8 in the official DreamerV3; the equations have none.
-    c_0, predicted at the replayed start, is included: a rollout from a terminal state weighs
-    nothing.
+    The official DreamerV3 weights the losses of Eq. 7 and 8 by it; the equations have no
+    weights. c_0, predicted at the replayed start, is included: a rollout from a terminal state
+    has weight 0.
 
     Args:
       cont: `[H, ...]` gamma * P(continue) at s_0..s_{H-1}, in [0, 1].

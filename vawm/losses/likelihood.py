@@ -1,4 +1,4 @@
-"""Maximum likelihood of experience: what the heads predict, and prior against posterior."""
+"""Maximum likelihood of experience: predictions of the heads, and prior against posterior."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PyTree = Any
 
 
 class PredictionLoss(NamedTuple):
-    """The parts of Eq. 3a, each `[...]`; the caller scales and averages them.
+    """The terms of Eq. 3a, each `[...]`; the caller scales and averages them.
 
     Attributes:
       reconstruction: squared error, in symlog units or of pixels in [0, 1], summed.
@@ -39,26 +39,26 @@ def prediction_loss(
     bins: Array,
     discount: float,
 ) -> PredictionLoss:
-    """How badly the heads predict what arrived with o_t, Eq. 3a.
+    """The errors of the heads about what arrived with o_t, Eq. 3a.
 
-        reconstruction = |o^ - symlog(o)|^2,  of images |o^ - o / 255|^2
+        reconstruction = |o^ - symlog(o)|^2,  for images |o^ - o / 255|^2
         reward = CE(r^, twohot(r)),  cont = CE(c^, discount * (1 - terminal))
 
-    All at the same index: the reward r_t and the flag arrive with o_t and are read from s_t.
-    The paper's text has squared error for the reward; its table and every public code have
-    the two-hot cross-entropy used here.
+    All at the same index: the reward r_t and the flag arrive with o_t and are predicted from
+    s_t. The paper's text has a squared error for the reward; its table and all public codes
+    have the two-hot cross-entropy used here.
 
     Args:
       obs_prediction: `[..., D]` in symlog units, or `[..., H, W, C]` in [0, 1] for images; or
-        a tree of such, whose losses are added up.
+        a tree of these, whose losses are summed.
       reward_logits: `[..., bins]`.
       cont_logit: `[...]`.
       obs: `[..., D]` floats in raw units, or `[..., H, W, C]` uint8; the same tree.
       reward: `[...]` in the units of `bins`.
       is_terminal: `[...]` bool.
-      bins: `[bins]` of the reward head: of rewards, or of their symlogs.
-      discount: gamma, which the continue head learns along with the end of episodes; 1 where it
-        learns that alone.
+      bins: `[bins]` of the reward head, rewards or their symlogs.
+      discount: gamma, if the continue head learns it together with the end of episodes; 1 if
+        it only learns the end of episodes.
 
     Returns:
       `PredictionLoss` of `[...]` losses. Gradients reach the predictions; the reward is
@@ -80,7 +80,7 @@ def prediction_loss(
 
 
 def reconstruction_loss(prediction: Array, target: Array) -> Array:
-    """Reconstruction of Eq. 3a for one array: `image_mse` of bytes, `symlog_mse` of floats.
+    """Reconstruction of Eq. 3a for one array: `image_mse` for uint8, `symlog_mse` for floats.
 
     Args:
       prediction: `[..., D]` in symlog units, or `[..., H, W, C]` in [0, 1].
@@ -97,7 +97,7 @@ def reconstruction_loss(prediction: Array, target: Array) -> Array:
 
 
 def symlog_mse(prediction: Array, target: Array) -> Array:
-    """Squared error in symlog units, summed: reconstruction of vectors, Eq. 3a.
+    """Summed squared error in symlog units: the reconstruction of vectors, Eq. 3a.
 
         L = sum_j (o^_j - symlog(o_j))^2
 
@@ -116,15 +116,15 @@ def symlog_mse(prediction: Array, target: Array) -> Array:
 
 
 def image_mse(prediction: Array, target: Array) -> Array:
-    """Squared error of pixels in [0, 1], summed: reconstruction of images.
+    """Summed squared error of pixels in [0, 1]: the reconstruction of images.
 
         L = sum (o^ - o / 255)^2
 
-    Both official codes have it so; in the paper's text Eq. 3a has symlogs of images too.
+    As in both official codes; Eq. 3a in the paper's text has symlogs for images too.
 
     Args:
       prediction: `[..., H, W, C]` in [0, 1].
-      target: `[..., H, W, C]` bytes from 0 to 255.
+      target: `[..., H, W, C]` uint8, from 0 to 255.
 
     Returns:
       `[...]` losses, in squared units of a pixel in [0, 1]. Nothing is stopped: the target is
@@ -139,12 +139,12 @@ def image_mse(prediction: Array, target: Array) -> Array:
 
 
 def continue_loss(logit: Array, target: Array) -> Array:
-    """Logistic regression of whether the episode goes on, Eq. 3a.
+    """Logistic regression of whether the episode continues, Eq. 3a.
 
         L = -(c log p + (1 - c) log(1 - p)),  p = sigmoid(logit)
 
-    c may be any probability: in the official DreamerV3 it is gamma, and 0 where terminal; in
-    the official STORM 1 and 0.
+    c may be any probability. In the official DreamerV3 it is gamma, and 0 if terminal; in the
+    official STORM it is 1 and 0.
 
     Args:
       logit: `[...]`.
@@ -170,13 +170,13 @@ def dynamics_loss(
     dynamics_scale: float,
     representation_scale: float,
 ) -> tuple[Array, Array]:
-    """Divergence of posterior and prior, Eq. 3b.
+    """KL divergence of posterior and prior, Eq. 3b.
 
         L = dynamics_scale * max(free, KL[sg q || p])
             + representation_scale * max(free, KL[q || sg p])
 
-    The paper prints a stop-gradient on both arguments of the second term, which leaves it
-    without a gradient; we follow DreamerV3 and stop only the prior.
+    The paper prints a stop-gradient on both arguments of the second term, which gives no
+    gradient; we follow DreamerV3 and stop only the prior.
 
     Args:
       post_logits: `[..., S, K]` of q(z|h,o), before unimix.
@@ -208,13 +208,13 @@ def batch_dynamics_loss(
     dynamics_scale: float,
     representation_scale: float,
 ) -> tuple[Array, Array]:
-    """As `dynamics_loss`, with the free nats of the mean over the batch: STORM's official code.
+    """As `dynamics_loss`, with free nats for the mean over the batch, as STORM's official code.
 
         L = dynamics_scale * max(free, mean KL[sg q || p])
             + representation_scale * max(free, mean KL[q || sg p])
 
-    Below the free nats no state has a gradient, however far its own prior is off. Means are
-    over all leading dims; the rest is Eq. 3b.
+    If the mean is below the free nats, no state has a gradient, however wrong its prior is.
+    Means are over all leading dims; otherwise as Eq. 3b.
 
     Args:
       post_logits: `[..., S, K]` of q(z|h,o), before unimix.
@@ -240,7 +240,7 @@ def batch_dynamics_loss(
 def balanced_kl(
     post_logits: Array, prior_logits: Array, *, unimix: float
 ) -> tuple[Array, Array]:
-    """Both terms of Eq. 3b without scales and free nats: equal numbers, other gradients.
+    """Both terms of Eq. 3b without scales and free nats: equal values, different gradients.
 
         KL[sg q || p]  and  KL[q || sg p],  summed over the categoricals
 

@@ -1,4 +1,4 @@
-"""Value-aware losses along a model unrolled for several steps, and what goes with them."""
+"""Value-aware losses along a model unrolled for several steps, with their helpers."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ def lambda_ac_loss(prediction_values: Array, target_values: Array, mask: Array) 
 
         L = sum_j mask_j (V(z^_j) - sg V(phi(x_j)))^2
 
-    z^_j is the model's latent after j steps from an encoded state, phi(x_j) the latent that
-    the encoder makes of what arrived. The original trains V apart from this loss, and adds a
-    reward loss and `latent_consistency_loss`.
+    z^_j is the model's latent after j steps from an encoded state, and phi(x_j) the encoded
+    latent of the observation. The original trains V separately, and adds a reward loss and
+    `latent_consistency_loss`.
 
     Args:
       prediction_values: `[H, ...]` V at z^_1..z^_H.
       target_values: `[H, ...]` V at phi(x_1)..phi(x_H), by the same critic.
-      mask: `[H, ...]` 1 where x_j is of the episode that the rollout started in, else 0.
+      mask: `[H, ...]` 1 if x_j belongs to the episode that the rollout started in, else 0.
 
     Returns:
       `[...]` losses, in squared units of the values. Targets and mask are stopped; the caller
@@ -39,21 +39,21 @@ def muzero_value_loss(values: Array, returns: Array, mask: Array) -> Array:
 
         L = mask_0 (v_0 - sg y_0)^2 + 1/K sum_{k=1..K} mask_k (v_k - sg y_k)^2
 
-    v_0 is the value of the encoded state and v_k that after the model was unrolled for k
+    v_0 is the value of the encoded state, and v_k that after the model was unrolled for k
     steps; y_k is bootstrapped from experience, by `n_step_returns`. The weights 1/K are the
-    original's scaling of gradients by 1/K at each head. It also halves gradients where the
-    dynamics take their state in: `scale_gradient(latent, scale=0.5)` before each step. Its
-    reward and policy losses are not here; for a categorical critic it has a cross-entropy
-    instead, `vawm.losses.transforms.two_hot_cross_entropy` to the same returns.
+    original's scaling of gradients by 1/K at each head. The original also halves gradients at
+    the input of the dynamics: `scale_gradient(latent, scale=0.5)` before each step. Its reward
+    and policy losses are not included. For a categorical critic it uses the cross-entropy
+    `vawm.losses.transforms.two_hot_cross_entropy` to the same returns instead.
 
-    The critic is NOT frozen: this one loss trains model and critic. Where the environment
-    is stochastic its minimum is not at the true model. The original trains on absorbing states
-    after an episode's end, with values of 0; with a `mask` they are left out instead.
+    The critic is NOT frozen: this loss trains both model and critic. In a stochastic
+    environment its minimum is not at the true model. The original trains on absorbing states
+    after an episode's end, with values of 0; here `mask` leaves them out.
 
     Args:
       values: `[K + 1, ...]` v_0..v_K.
       returns: `[K + 1, ...]` y_0..y_K, from a slow critic or the current one.
-      mask: `[K + 1, ...]` 1 where x_k is of the episode that the unroll started in, else 0.
+      mask: `[K + 1, ...]` 1 if x_k belongs to the episode that the unroll started in, else 0.
 
     Returns:
       `[...]` losses, in squared units of the values. Returns and mask are stopped.
@@ -75,9 +75,9 @@ def n_step_returns(reward: Array, discount: Array, value: Array, *, steps: int) 
     belongs to s_{k+1}.
 
     Args:
-      reward: `[T, ...]` r_1..r_T, in units of the environment or of the caller's choice.
-      discount: `[T, ...]` gamma at s_1..s_T, 0 where terminal. A window has to lie within one
-        episode up to a terminal state: past a time limit, rewards of the next one would count.
+      reward: `[T, ...]` r_1..r_T, in any unit.
+      discount: `[T, ...]` gamma at s_1..s_T, 0 if terminal. A window must not extend beyond a
+        time limit, because rewards of the next episode would count.
       value: `[T, ...]` v_1..v_T, in the units of the reward.
       steps: n, from 1 to T.
 
@@ -100,16 +100,16 @@ def n_step_returns(reward: Array, discount: Array, value: Array, *, steps: int) 
 
 
 def scale_gradient(x: Array, *, scale: float) -> Array:
-    """The same numbers with a scaled gradient (Schrittwieser et al., 2020).
+    """The identity with a scaled gradient (Schrittwieser et al., 2020).
 
         y = sg x + scale * (x - sg x)
 
     Args:
       x: `[...]` of any unit.
-      scale: by which the gradient is multiplied: 1/2 in MuZero, before each step of the model.
+      scale: factor of the gradient; 1/2 in MuZero, before each step of the model.
 
     Returns:
-      `[...]` exactly x where it is finite.
+      `[...]` exactly x if it is finite.
     """
     stopped = jax.lax.stop_gradient(x)
     return stopped + scale * (x - stopped)
@@ -120,8 +120,8 @@ def latent_consistency_loss(prediction: Array, target: Array) -> Array:
 
         L = |z^_j - sg phi(x_j)|^2
 
-    lambda-AC (Voelcker et al., 2023) adds it to keep latents from drifting to wherever the
-    critic sees no difference; phi is then a slow copy of the encoder, as in BYOL.
+    lambda-AC (Voelcker et al., 2023) adds it to keep latents from drifting where the critic
+    does not depend on them; phi is then a slow copy of the encoder, as in BYOL.
 
     Args:
       prediction: `[..., D]` latents of the model.
@@ -138,7 +138,7 @@ def latent_consistency_loss(prediction: Array, target: Array) -> Array:
 
 
 def _masked_squares(values: Array, targets: Array, mask: Array) -> Array:
-    """`[H, ...]` squared errors of the values alone, 0 where masked."""
+    """`[H, ...]` squared errors, 0 where masked; only the values have a gradient."""
     targets, mask = jax.lax.stop_gradient((targets, mask))
-    # What is masked may be anything, so it is left out before it is squared.
+    # Masked errors may be anything, so they are replaced by 0 before squaring.
     return mask * jnp.square(jnp.where(mask == 0, 0.0, values - targets))

@@ -31,8 +31,8 @@ def lambda_returns(
       reward: `[H, ...]` rewards r_1..r_H, in environment units (not symlog).
       discount: `[H, ...]` gamma * P(continue) at s_1..s_H, in [0, 1].
       value: `[H, ...]` critic means v_1..v_H, in environment units.
-      bootstrap: `[...]` v_H where `value` is indexed otherwise: STORM's official code mixes in
-        v_t in the place of v_{t+1}, and passes v_0..v_{H-1} as `value`.
+      bootstrap: `[...]` v_H, only if `value` is indexed differently: STORM's official code
+        uses v_t instead of v_{t+1}, and passes v_0..v_{H-1} as `value`.
       lambda_: mixing weight; 0 is one-step TD, 1 is Monte Carlo.
 
     Returns:
@@ -63,14 +63,14 @@ def replay_returns(
     discount: float,
     lambda_: float,
 ) -> Array:
-    """Lambda-returns along replayed experience, for the replay value loss: Eq. 7 in replay.
+    """Lambda-returns along replayed experience, for the replay value loss; Eq. 7 in replay.
 
         R_t = r_{t+1} + gamma * (1 - term_{t+1})
               * ((1 - lambda_{t+1}) * b_{t+1} + lambda_{t+1} * R_{t+1})
         lambda_t = lambda * (1 - last_t),   R_{T-1} = b_{T-1}
 
     As in the official DreamerV3, b_t is the imagined return that starts at s_t, not a critic
-    value. An episode that ends without being terminal bootstraps fully from its last state.
+    value. A truncated episode bootstraps fully from its last state.
 
     Args:
       reward: `[B, T]` rewards r_0..r_{T-1}, in environment units; r_0 is not used.
@@ -82,7 +82,7 @@ def replay_returns(
 
     Returns:
       `[B, T - 1]` returns R_0..R_{T-2}, in environment units. Gradients are not stopped here.
-      The caller masks t where `is_last`: what follows it is another episode.
+      The caller masks t where `is_last`, because another episode follows.
 
     Raises:
       AssertionError: the shapes are not `[B, T]`, all the same.
@@ -116,7 +116,7 @@ def init_return_scale() -> ReturnScale:
     """The averages of Eq. 9 before the first update.
 
     Returns:
-      `ReturnScale` of both percentiles at 0, `[]` each; they are not debiased, as in the
+      `ReturnScale` with both percentiles 0, each `[]`; without bias correction, as in the
       official DreamerV3.
     """
     return ReturnScale(low=jnp.zeros(()), high=jnp.zeros(()))
@@ -125,14 +125,14 @@ def init_return_scale() -> ReturnScale:
 def update_return_scale(
     state: ReturnScale, returns: Array, *, decay: float, low: float, high: float
 ) -> ReturnScale:
-    """Move towards the percentiles of a batch of returns, Eq. 9. Update before use.
+    """Moves towards the percentiles of a batch of returns, Eq. 9. Update before use.
 
         Per <- decay * Per + (1 - decay) * quantile(R),  for both fractions
 
     Args:
       state: the averages so far.
       returns: `[...]` all returns of the batch, pooled, in environment units.
-      decay: share of the old average that stays.
+      decay: share of the old average that is kept.
       low: lower fraction, such as 0.05.
       high: upper fraction, such as 0.95.
 
@@ -147,15 +147,15 @@ def update_return_scale(
 
 
 def return_scale(state: ReturnScale, *, limit: float) -> Array:
-    """What divides advantages, Eq. 9; at limit 1 it never enlarges them.
+    """The divisor of advantages, Eq. 9; with limit 1 it never enlarges them.
 
         S = max(limit, high - low)
 
     Args:
       state: the averages, after their update.
-      limit: the least S, in environment units.
+      limit: the smallest S, in environment units.
 
     Returns:
-      `[]` S, in environment units. Nothing is stopped here: updates are.
+      `[]` S, in environment units. Nothing is stopped here; updates are stopped.
     """
     return jnp.maximum(limit, state.high - state.low)

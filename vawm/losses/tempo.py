@@ -1,4 +1,4 @@
-"""TEMPO: learn how much each sample of a likelihood loss should weigh for the task."""
+"""TEMPO: learns the weight of each sample of a likelihood loss for the task."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ def tempo_meta_gradient(
         gradient = d L_task(theta'(phi)) / d phi
                  = -step_size * sum_i <grad L_task(theta'), grad L_i(theta)> dw_i / dphi
 
-    A sample gains weight where learning from it also lowers the task loss.
+    A sample gains weight if learning from it also lowers the task loss.
 
-    Known of the original: weights from a network phi for the samples of the likelihood loss; a
-    bi-level problem, with phi above, judged by a task-aware loss of the model below; one
-    unrolled step in between. Our reading: that step is plain gradient descent, the weights
-    enter as a sum, and how they are normalised and what the task loss is stay with the
-    caller: `weights` returns them as they enter, and `task_loss` may be the divergence of
-    values under prior and posterior, as in `value_alignment_loss`.
+    Known about the original: a network phi gives the weights of the samples of the likelihood
+    loss; the problem is bi-level, with phi at the upper level, judged by a task-aware loss of
+    the lower-level model after one unrolled step. Our reading: that step is plain gradient
+    descent, and the weights enter as a sum. The caller chooses their normalisation (`weights`
+    returns them as they enter) and the task loss, for example the divergence of values under
+    prior and posterior, as in `value_alignment_loss`.
 
     Nothing is updated here: the caller steps phi along the gradient, then theta with weights
     w_i(phi), by its own optimisers. theta is held fixed and the inner gradient is linear in
-    the weights, so L_i needs no second derivative: a `custom_vjp` without one will do.
+    the weights, so L_i needs no second derivative: a `custom_vjp` without one is enough.
 
     Args:
       sample_losses: maps theta to `[...]` L_i, one per sample, of one batch.
@@ -50,15 +50,14 @@ def tempo_meta_gradient(
 
     Returns:
       `[]` L_task(theta') in its own units, and its gradient, a tree like `weight_params`.
-      Nothing but phi is differentiated, so a critic in `task_loss` is left as it is, stopped or
-      not.
+      Only phi is differentiated, so a critic in `task_loss` gets no gradient, stopped or not.
 
     Raises:
       AssertionError: losses and weights have different shapes, or L_task is not a scalar.
 
     Examples:
-      A line through 0 and three samples, of which the last leads away from the slope 2 of the
-      task. The network of the weights has one layer; it reads the samples.
+      A line through 0 and three samples; the last one leads away from the task's slope 2. The
+      network of the weights has one layer and reads the samples.
 
       >>> import jax, jax.numpy as jnp
       >>> from vawm import losses
@@ -76,7 +75,7 @@ def tempo_meta_gradient(
       >>> print(f"{loss:.4f} {gradient['x']:.4f} {gradient['y']:.4f}")
       1.6044 1.6889 -4.3911
 
-      Then both learn, the weights first: less of large x, more of large y.
+      Then both learn, the weights first: less weight for large x, more for large y.
 
       >>> phi = jax.tree.map(lambda p, g: p - 0.1 * g, phi, gradient)
       >>> step = jax.grad(lambda theta: (weights(phi) * sample_losses(theta)).sum())(theta)

@@ -1,7 +1,7 @@
 """Symlog, the two-hot code over symexp-spaced bins, and categorical arithmetic.
 
-The bins reach +-4.85e8 and are exactly symmetric, so sums over them are arranged to cancel
-exactly where they should. Everything here computes in float32, whatever the logits are.
+The bins reach +-4.85e8 and are exactly symmetric, and sums over them are arranged such that
+symmetric terms cancel exactly. Everything is computed in float32, whatever the logits' dtype.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ Array = jax.Array
 
 
 def symlog(x: Array) -> Array:
-    """Compresses magnitude, keeps sign and the slope around 0 (DreamerV3; Hafner et al., 2025).
+    """Compresses magnitude, keeps sign and slope around 0 (DreamerV3; Hafner et al., 2025).
 
         symlog(x) = sign(x) * log(1 + |x|)
 
-    At exactly 0 JAX gives the gradient 0 instead of 1, as of the absolute value.
+    At exactly 0, JAX's gradient is 0 instead of 1, as for the absolute value.
 
     Args:
       x: `[...]` in raw units.
@@ -42,7 +42,7 @@ def symexp(x: Array) -> Array:
       x: `[...]` in symlog units.
 
     Returns:
-      `[...]` in raw units. Nothing is stopped. As of `symlog`, the gradient at 0 is 0.
+      `[...]` in raw units. Nothing is stopped. As for `symlog`, the gradient at 0 is 0.
     """
     return jnp.sign(x) * jnp.expm1(jnp.abs(x))
 
@@ -68,9 +68,9 @@ class TwoHot(NamedTuple):
     """A two-hot code of real numbers.
 
     Attributes:
-      bins: `[n]` increasing values that the classes stand for.
-      encode: `[...]` numbers -> `[...]` in the units of `bins`; targets of a cross-entropy.
-      mean: `[..., n]` logits -> `[...]` numbers, the inverse of `encode` at the mean.
+      bins: `[n]` increasing values of the classes.
+      encode: `[...]` numbers -> `[...]` targets of a cross-entropy, in the units of `bins`.
+      mean: `[..., n]` logits -> `[...]` numbers: the mean over `bins`, decoded.
     """
 
     bins: Array
@@ -79,19 +79,19 @@ class TwoHot(NamedTuple):
 
 
 def make_two_hot(n: int, spacing: Literal["symexp", "symlog"]) -> TwoHot:
-    """A code of `n` bins that reaches +-symexp(20).
+    """A two-hot code with `n` bins up to +-symexp(20).
 
-    "symexp", as in DreamerV3: bins are numbers, spaced by symexp, and a mean is one of numbers.
-    "symlog", as in STORM: bins are symlogs, evenly spaced, and a mean is one of symlogs, which
-    is decoded then: where classes disagree, that is nearer to 0.
+    "symexp", as in DreamerV3: the bins are raw numbers, spaced by symexp, and the mean is over
+    raw numbers. "symlog", as in STORM: the bins are symlogs, evenly spaced, and the mean over
+    symlogs is decoded. For spread-out distributions the latter is nearer to 0.
 
     Args:
-      n: number of bins; odd for a code with a bin at 0.
+      n: number of bins; odd for a bin at 0.
       spacing: of the bins.
 
     Returns:
-      `TwoHot` of `[n]` bins, in raw units or in symlogs, and two functions of any leading dims.
-      `mean` has a gradient by its logits; nothing is stopped in `encode` either.
+      `TwoHot` of `[n]` bins, in raw units or in symlogs, and two functions for any leading
+      dims. Neither function stops gradients.
 
     Raises:
       ValueError: fewer than two bins spaced by symexp.
@@ -102,7 +102,7 @@ def make_two_hot(n: int, spacing: Literal["symexp", "symlog"]) -> TwoHot:
     bins = jnp.linspace(-20.0, 20.0, n)
 
     def mean(logits: Array) -> Array:
-        # Not a product, which accelerators would round to fewer bits.
+        # Not a matrix product, which accelerators would round to fewer bits.
         probs = jax.nn.softmax(logits.astype(jnp.float32))
         return symexp((probs * jnp.expand_dims(bins, tuple(range(logits.ndim - 1)))).sum(-1))
 
@@ -110,9 +110,9 @@ def make_two_hot(n: int, spacing: Literal["symexp", "symlog"]) -> TwoHot:
 
 
 def two_hot(y: Array, bins: Array) -> Array:
-    """`[..., n]` distribution on the two bins around `y` whose mean is `y`.
+    """The distribution `[..., n]` on the two bins around `y` with mean `y`.
 
-    Weights are linear in raw distance; `y` beyond the ends goes onto the end bin. Losses do
+    Weights are linear in raw distance; a `y` beyond the ends is put on the end bin. Losses do
     not build this array: see `two_hot_cross_entropy`.
     """
     below, above, share = _neighbours(y, bins)
@@ -123,8 +123,8 @@ def two_hot(y: Array, bins: Array) -> Array:
 def two_hot_mean(logits: Array, bins: Array) -> Array:
     """Mean of softmax(logits) over `bins`, in raw space: sum_i p_i * bins_i.
 
-    Mirrored bins are paired before anything is added, (p_{n-1-i} - p_i) * bins_{n-1-i}, so
-    that symmetric logits, such as those of a zero-initialised head, give exactly 0.
+    Mirrored bins are paired before summing, (p_{n-1-i} - p_i) * bins_{n-1-i}, so that
+    symmetric logits, such as those of a zero-initialised head, give exactly 0.
 
     Args:
       logits: `[..., n]`.
@@ -147,12 +147,12 @@ def two_hot_cross_entropy(logits: Array, target: Array, bins: Array) -> Array:
 
         CE = logsumexp(logits) - (1 - w) * logits[below] - w * logits[above]
 
-    w is what the target is on its way from the bin below to the bin above. This is
+    w is the target's fractional position between the two bins. This is
     `two_hot_cross_entropies` for a single target.
 
     Args:
       logits: `[..., n]`.
-      target: `[...]` in the units of `bins`; beyond the ends it is clipped.
+      target: `[...]` in the units of `bins`; clipped to the end bins.
       bins: `[n]` increasing, such as `TwoHot.bins`.
 
     Returns:
@@ -172,12 +172,12 @@ def two_hot_cross_entropies(
 
         CE_k = logsumexp(logits) - (1 - w_k) * logits[below_k] - w_k * logits[above_k]
 
-    The two logits are read by index and the log-sum-exp is shared, so no dense target and no
-    log-softmax is ever built.
+    The two logits are read by index and the log-sum-exp is shared, so neither dense targets
+    nor a log-softmax are built.
 
     Args:
       logits: `[..., n]`.
-      targets: each `[...]`, in the units of `bins`; beyond the ends they are clipped.
+      targets: each `[...]`, in the units of `bins`; clipped to the end bins.
       bins: `[n]` increasing.
 
     Returns:
@@ -199,7 +199,7 @@ def two_hot_cross_entropies(
 
 
 def unimix_logits(logits: Array, unimix: float) -> Array:
-    """log((1 - u) * softmax(logits) + u / K): normalised, and no class below u / K."""
+    """log((1 - u) * softmax(logits) + u / K): normalised, each class at least u / K."""
     log_prob = jax.nn.log_softmax(logits.astype(jnp.float32))
     if unimix == 0:
         return log_prob
@@ -207,7 +207,7 @@ def unimix_logits(logits: Array, unimix: float) -> Array:
 
 
 def categorical_kl(p_logits: Array, q_logits: Array) -> Array:
-    """The divergence in Eq. 3b, 4 and 5: KL[softmax(p) || softmax(q)] over the last axis.
+    """KL[softmax(p) || softmax(q)] over the last axis, as in Eq. 3b, 4 and 5.
 
         KL = sum_k p_k (log p_k - log q_k)
 
@@ -235,12 +235,12 @@ def categorical_entropy(logits: Array) -> Array:
 
 def _neighbours(y: Array, bins: Array) -> tuple[Array, Array, Array]:
     """Indices of the bins below and above `y`, and the weight of the one above."""
-    # Clipping keeps NaN, which the weight then carries: a broken target is not hidden.
+    # Clipping keeps NaN, and the weight becomes NaN: a broken target is not hidden.
     y = jnp.clip(y.astype(jnp.float32), bins[0], bins[-1])
     after = jnp.searchsorted(bins, y, side="right")
     last = bins.shape[0] - 1
     below, above = jnp.clip(after - 1, 0, last), jnp.clip(after, 0, last)
-    # At the upper end both are the last bin: its weight is 1 whatever the share.
+    # At the upper end both are the last bin, whose weight is 1 for any share.
     gap = jnp.where(below == above, 1.0, bins[above] - bins[below])
     return below, above, (y - bins[below]) / gap
 

@@ -1,4 +1,4 @@
-"""VaGraM: errors of the model's next state, weighed by how much the value depends on them."""
+"""VaGraM: errors of the model's next state, weighted by how much the value depends on them."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ def vagram_loss(value: Value, prediction: Array, target: Array) -> Array:
         L = sum_j (dV/dx_j)^2 e_j^2,    e = prediction - sg(x),    dV/dx at sg(x)
 
     n L bounds (grad V . e)^2, the square of the first-order expansion of V(prediction) - V(x),
-    where n is the size of x (Cauchy-Schwarz). Unlike that, L is least only where e_j = 0 for
-    every j with dV/dx_j other than 0 at x: errors in different dims never cancel.
+    where n is the size of x (Cauchy-Schwarz). Unlike that square, L is minimal only if e_j = 0
+    for every j with dV/dx_j other than 0 at x: errors in different dims never cancel.
 
     Args:
-      value: maps `[..., n]` to `[...]`, each value from its own state alone.
+      value: maps `[..., n]` to `[...]`, one value per state.
       prediction: `[..., n]` the model's next state.
-      target: `[..., n]` x, the true next state, or what the encoder makes of it.
+      target: `[..., n]` x, the true next state, or its encoding.
 
     Returns:
-      `[...]` losses, in squared units of the value. Their gradient reaches `prediction` alone:
-      the target, dV/dx and with it all that `value` closes over are stopped.
+      `[...]` losses, in squared units of the value. Their gradient reaches only `prediction`:
+      the target and dV/dx, and so everything that `value` closes over, are stopped.
 
     Raises:
-      AssertionError: the states have different shapes, or the values are not one for each.
+      AssertionError: the states have different shapes, or there is not one value per state.
     """
     error, gradient = _error_and_gradient(value, prediction, target)
     return jnp.square(gradient * error).sum(-1)
@@ -42,21 +42,21 @@ def vagram_taylor_loss(value: Value, prediction: Array, target: Array) -> Array:
 
         L = (grad V . e)^2,    e = prediction - sg(x),    grad V at sg(x)
 
-    L is zero on the whole hyperplane grad V . e = 0, however long e is. A prediction can
-    drift along it without bound, to where the expansion says nothing about the value;
-    `vagram_loss` has no such direction but those along which V is flat at x.
+    L is zero on the whole hyperplane grad V . e = 0, however large e is. A prediction can
+    drift along it without bound, to states where the expansion is not valid. `vagram_loss`
+    has no such directions except those along which V is flat at x.
 
     Args:
-      value: maps `[..., n]` to `[...]`, each value from its own state alone.
+      value: maps `[..., n]` to `[...]`, one value per state.
       prediction: `[..., n]` the model's next state.
-      target: `[..., n]` x, the true next state, or what the encoder makes of it.
+      target: `[..., n]` x, the true next state, or its encoding.
 
     Returns:
       `[...]` losses, in squared units of the value. As in `vagram_loss`, their gradient reaches
-      `prediction` alone.
+      only `prediction`.
 
     Raises:
-      AssertionError: the states have different shapes, or the values are not one for each.
+      AssertionError: the states have different shapes, or there is not one value per state.
     """
     error, gradient = _error_and_gradient(value, prediction, target)
     return jnp.square((gradient * error).sum(-1))
@@ -69,24 +69,23 @@ def vagram_second_order_loss(value: Value, prediction: Array, target: Array) -> 
 
     g and H are gradient and Hessian of V at sg(x); e = prediction - sg(x). The right side is
     the square of the second-order expansion of V(prediction) - V(x); the step to L is
-    (a + b)^2 <= 2 a^2 + 2 b^2. L is zero where both terms are, so it has the drawback of
-    `vagram_taylor_loss`: e can grow where g . e = e' H e = 0.
+    (a + b)^2 <= 2 a^2 + 2 b^2. L is zero if both terms are zero, so it has the drawback of
+    `vagram_taylor_loss`: e can grow along g . e = e' H e = 0.
 
-    H e is a Hessian-vector product: no Hessian is built and none is decomposed. A network of
-    ReLUs has H = 0 almost everywhere.
+    H e is a Hessian-vector product: no Hessian is built or decomposed. A network of ReLUs has
+    H = 0 almost everywhere.
 
     Args:
-      value: maps `[..., n]` to `[...]`, each value from its own state alone. It is
-        differentiated twice.
+      value: maps `[..., n]` to `[...]`, one value per state; it is differentiated twice.
       prediction: `[..., n]` the model's next state.
-      target: `[..., n]` x, the true next state, or what the encoder makes of it.
+      target: `[..., n]` x, the true next state, or its encoding.
 
     Returns:
       `[...]` losses, in squared units of the value. The target and g are stopped. H e is not,
-      as `prediction` is in it: the caller stops the critic's parameters.
+      because it contains `prediction`: the caller stops the critic's parameters.
 
     Raises:
-      AssertionError: the states have different shapes, or the values are not one for each.
+      AssertionError: the states have different shapes, or there is not one value per state.
     """
     error, gradient = _error_and_gradient(value, prediction, target)
     curvature = (error * _hessian_product(value, target, error)).sum(-1)
@@ -94,7 +93,7 @@ def vagram_second_order_loss(value: Value, prediction: Array, target: Array) -> 
 
 
 def vagram_joint_loss(value: Value, prediction: Array, target: Array) -> Array:
-    """Second order with the diagonal first term: `joint` of the code of Voelcker et al., 2022.
+    """Second order with a diagonal first term: `joint` in the code of Voelcker et al., 2022.
 
         L = 2 sum_j g_j^2 e_j^2 + 1/2 |H e|^2
 
@@ -107,10 +106,9 @@ def vagram_joint_loss(value: Value, prediction: Array, target: Array) -> Array:
     `vagram_second_order_loss`; the first term is twice `vagram_loss`.
 
     Args:
-      value: maps `[..., n]` to `[...]`, each value from its own state alone. It is
-        differentiated twice.
+      value: maps `[..., n]` to `[...]`, one value per state; it is differentiated twice.
       prediction: `[..., n]` the model's next state.
-      target: `[..., n]` x, the true next state, or what the encoder makes of it.
+      target: `[..., n]` x, the true next state, or its encoding.
 
     Returns:
       `[...]` losses. The first term is in squared units of the value, the second also per
@@ -118,7 +116,7 @@ def vagram_joint_loss(value: Value, prediction: Array, target: Array) -> Array:
       critic's parameters.
 
     Raises:
-      AssertionError: the states have different shapes, or the values are not one for each.
+      AssertionError: the states have different shapes, or there is not one value per state.
     """
     error, gradient = _error_and_gradient(value, prediction, target)
     curvature = _hessian_product(value, target, error)
@@ -139,7 +137,7 @@ def _hessian_product(value: Value, target: Array, error: Array) -> Array:
 
 
 def _gradient(value: Value) -> Value:
-    """`[..., n]` to the gradient of each value: that of their sum, as states do not mix."""
+    """Maps `[..., n]` to the gradient of each value: that of the sum, as states do not mix."""
 
     def total(x: Array) -> Array:
         values = value(x)

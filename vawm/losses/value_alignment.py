@@ -1,4 +1,4 @@
-"""Value alignment: make the predicted state worth what the inferred state is worth."""
+"""Value alignment: gives the predicted state the same value as the inferred state."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ def value_alignment_loss(
     dynamics_scale: float,
     representation_scale: float,
 ) -> Array:
-    """Divergence of the value distributions at s_t and at its prediction s~_t, Eq. 4.
+    """KL divergence of the value distributions at s_t and at its prediction s~_t, Eq. 4.
 
         L = dynamics_scale * KL[sg V(s) || V(s~)] + representation_scale * KL[V(s) || sg V(s~)]
 
     s = (h, z) with z from the posterior and s~ = (h, z~) with z~ from the prior. The paper
-    prints a stop-gradient on both arguments of the second term, which leaves it without a
-    gradient; as in its Eq. 3 we stop only the prediction. `representation_scale=0` gives the
-    gradient as printed.
+    prints a stop-gradient on both arguments of the second term, which gives no gradient; as in
+    its Eq. 3 we stop only the prediction. `representation_scale=0` gives the gradient as
+    printed.
 
-    No free nats are subtracted. The loss is exactly 0 where both logits are equal, as with a
+    There are no free nats. The loss is exactly 0 if both logits are equal, as with a
     zero-initialised critic.
 
     Args:
@@ -38,7 +38,7 @@ def value_alignment_loss(
 
     Returns:
       `[...]` losses in nats. Gradients reach both logits: the caller stops the critic's
-      parameters, or the critic learns to be indifferent instead.
+      parameters; otherwise the critic would learn to ignore the difference.
 
     Raises:
       AssertionError: the shapes differ.
@@ -50,7 +50,7 @@ def value_alignment_loss(
 
 
 def value_alignment_weight(latent_kl: Array, step: Array, *, warmup_steps: int) -> Array:
-    """Weight of the loss at each state, Eq. 5: small where the prediction is poor.
+    """Weight of the loss at each state, Eq. 5: small if the prediction is poor.
 
         beta_t = [step > warmup_steps] / max(1, sg KL_t)
 

@@ -1,7 +1,7 @@
-"""Value-aware model learning: predict next states that are worth what the true one is worth.
+"""Value-aware model learning: predict next states with the value of the true next state.
 
-Values come in already computed, by the same critic on both sides; the caller stops that
-critic's parameters, or it learns to be indifferent to the model's errors instead.
+Values are passed in, computed by the same critic on both sides. The caller stops the critic's
+parameters; otherwise the critic would learn to ignore the model's errors.
 """
 
 from __future__ import annotations
@@ -18,22 +18,22 @@ def vaml_loss(prediction_values: Array, target_values: Array) -> Array:
 
         L = max_{k=1..K} (1/M sum_{m=1..M} V_k(x^_m) - sg V_k(x'))^2
 
-    The original takes the supremum over a class of value functions, of the squared error of
-    the expected value. The maximum over K critics stands in for it, at each element: the mean
-    of these maxima is at least the largest mean error of any of the critics. M samples raise
-    L by their noise, as in `iter_vaml_loss`.
+    The original takes the supremum, over a class of value functions, of the squared error of
+    the expected value. Here the maximum over K critics replaces it, at each element: the mean
+    of these maxima is at least the largest mean error of any critic. The noise of M samples
+    raises L, as in `iter_vaml_loss`.
 
     Args:
-      prediction_values: `[K, M, ...]`: critics first, then samples, then one entry for each
-        transition, such as `[K, M, B, T]`. V_k at samples x^_1..x^_M of the model's next
-        state; M = 1 for a deterministic model.
-      target_values: `[K, ...]`, such as `[K, B, T]`: V_k at the true next state x', which has
-        no axis of samples.
+      prediction_values: `[K, M, ...]`: critics, samples, then one entry per transition, such
+        as `[K, M, B, T]`. V_k at samples x^_1..x^_M of the model's next state; M = 1 for a
+        deterministic model.
+      target_values: `[K, ...]`, such as `[K, B, T]`: V_k at the true next state x', without an
+        axis of samples.
 
     Returns:
       `[...]` losses, such as `[B, T]`, in squared units of the values. Targets are stopped. At
-      each transition the gradient reaches the predictions by the critic that is furthest off
-      alone (shared where critics tie); the caller stops the critics' parameters.
+      each transition, only the critic with the largest error sends a gradient to the
+      predictions (shared if critics tie); the caller stops the critics' parameters.
 
     Raises:
       AssertionError: the shapes do not fit each other.
@@ -43,13 +43,13 @@ def vaml_loss(prediction_values: Array, target_values: Array) -> Array:
 
 
 def iter_vaml_loss(prediction_values: Array, target_value: Array) -> Array:
-    """Iterative VAML (Farahmand, 2018): VAML with the one critic that is being learned.
+    """Iterative VAML (Farahmand, 2018): VAML with the single critic that is being learned.
 
         L = (mean_m V(x^_m) - sg V(x'))^2
 
-    The mean over samples stands for the expectation under the model. Its noise raises L by
+    The mean over samples estimates the expectation under the model. Its noise raises L by
     Var[V(x^)] / M on average, which rewards a model for being too certain; `cvaml_loss`
-    takes that out.
+    removes that bias.
 
     Args:
       prediction_values: `[M, ...]` V at M samples of the model's next state.
@@ -73,19 +73,19 @@ def cvaml_loss(prediction_values: Array, target_value: Array) -> Array:
           = sum over i != j of (V(x^_i) - y) (V(x^_j) - y) / (M (M - 1))
 
     Var is the unbiased variance of the M samples. Given y, the mean of L over independent
-    samples is (E V(x^) - y)^2. The paper's body was not at hand: the correction is derived
-    here from the bias that it names.
+    samples is (E V(x^) - y)^2. The full paper was not available to us: the correction is
+    derived here from the bias that it describes.
 
-    y = V(x') makes this IterVAML; a value bootstrapped from later steps of experience may
-    stand in its place. The noise of y adds its variance, whatever the model.
+    With y = V(x') this corrects IterVAML; y may also be a value bootstrapped from later steps
+    of experience. The noise of y adds its variance, whatever the model.
 
     Args:
       prediction_values: `[M, ...]` V at M >= 2 independent samples of the model's next state.
       target_value: `[...]` y.
 
     Returns:
-      `[...]` losses, in squared units of the values; single ones can be negative. The target
-      is stopped; the caller stops the critic's parameters.
+      `[...]` losses, in squared units of the values; they can be negative. The target is
+      stopped; the caller stops the critic's parameters.
 
     Raises:
       ValueError: fewer than two samples.
@@ -100,13 +100,13 @@ def cvaml_loss(prediction_values: Array, target_value: Array) -> Array:
 
 
 def categorical_iter_vaml_loss(prediction_logits: Array, target_logits: Array) -> Array:
-    """IterVAML between distributions of values: public code of MAD-TD (Voelcker et al., 2025a).
+    """IterVAML for distributions of values, as in MAD-TD's code (Voelcker et al., 2025a).
 
         L = -sum_k sg v_k(x') log v_k(x^)
 
     This is the first term of `value_alignment_loss`, KL[sg v(x') || v(x^)], plus the entropy
-    of the target: it is not 0 where both are equal, and has the same gradient. In that code
-    the target critic gives both logits.
+    of the target: it is not 0 if both are equal, but has the same gradient. In MAD-TD's public
+    code, the target critic gives both logits.
 
     Args:
       prediction_logits: `[..., bins]` critic logits at the model's next state.
@@ -124,6 +124,6 @@ def categorical_iter_vaml_loss(prediction_logits: Array, target_logits: Array) -
 
 
 def _deviations(prediction_values: Array, target_value: Array) -> Array:
-    """`[M, ...]` by how much each sample's value is above the stopped target."""
+    """`[M, ...]` difference of each sample's value from the stopped target."""
     chex.assert_shape(prediction_values, (None, *target_value.shape))
     return prediction_values - jax.lax.stop_gradient(target_value)[None]

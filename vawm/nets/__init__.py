@@ -1,11 +1,12 @@
 """Layers, as Flax modules; the only importer of `flax.linen`.
 
 layers         Linear, RMSNorm, MLP
-recurrent      block GRU, posterior and prior of DreamerV3
-convolution    its encoder and decoder of images
-relu           the linear layers of STORM
-strided        its encoder and decoder of images, with BatchNorm
-transformer    its sequence model
+recurrent      DreamerV3's block GRU, posterior and prior
+convolution    DreamerV3's encoder and decoder of images
+relu           STORM's linear layers
+strided        STORM's encoder and decoder of images
+batch_norm     STORM's BatchNorm
+transformer    STORM's sequence model
 """
 
 from vawm.nets.convolution import HALVINGS, STAGE_WIDTHS, ImageDecoder, ImageEncoder

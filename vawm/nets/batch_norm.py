@@ -1,8 +1,8 @@
-"""Batch normalisation as torch defines it, with a gradient written by hand.
+"""Batch normalisation as defined by torch, with a hand-written gradient.
 
-Parameters `scale` (1) and `bias` (0) are in the collection "params"; the running `mean` (0)
-and `var` (1) are in "statistics", and nobody differentiates them. All of them are float32, and
-so is what is computed with them, whatever the input is.
+Parameters `scale` (initially 1) and `bias` (0) are in the collection "params". The running
+`mean` (0) and `var` (1) are in "statistics" and are never differentiated. All are float32, and
+computations with them are in float32, whatever the input's dtype.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ import jax.numpy as jnp
 from vawm.types import Array
 
 EPSILON = 1e-5
-MOMENTUM = 0.1  # how much of the running statistics a batch replaces
+MOMENTUM = 0.1  # fraction of the running statistics that a batch replaces
 
 
 def batch_mean(x: Array) -> Array:
-    """Mean over all axes but the last, in float32: first of every x[i], then over i.
+    """Mean over all axes but the last, in float32: first within every x[i], then over i.
 
-    In one go a CPU would add up everything on a single core.
+    In one step, a CPU would compute the sum on a single core.
     """
     x = x.astype(jnp.float32)
     if x.ndim > 2:
@@ -36,11 +36,11 @@ def per_channel(x: Array, like: Array) -> Array:
 
 @jax.custom_vjp
 def normalise(x: Array, scale: Array, bias: Array) -> tuple[Array, Array, Array]:
-    """(x - mean) / sqrt(var + 1e-5) * scale + bias; mean; var, of all axes but the last.
+    """(x - mean) / sqrt(var + 1e-5) * scale + bias; mean; var, over all axes but the last.
 
-    `var` divides by the count and is taken around the mean, in a second pass: nothing
-    cancels where the mean is large. The gradient of the first result is exact, through mean
-    and var; `mean` and `var` as results pass none on.
+    `var` divides by the count and is computed around the mean in a second pass, which avoids
+    cancellation if the mean is large. The gradient of the first result is exact, through mean
+    and var; the results `mean` and `var` have no gradient.
     """
     return _forward(x, scale, bias)[0]
 
@@ -75,13 +75,13 @@ def affine(x: Array, factor: Array, shift: Array) -> Array:
 
 
 class BatchNorm(nn.Module):
-    """BatchNorm over all axes but the last, `[..., features]` -> the same.
+    """BatchNorm over all axes but the last, `[..., features]` -> `[..., features]`.
 
-    With `train=True` the batch's own mean and biased variance normalise, gradients pass
-    through both, and the running statistics become 0.9 running + 0.1 batch, the batch's
-    variance unbiased there (count - 1; of a batch of one value it stays biased). That takes
-    `mutable=["statistics"]`; `init` leaves them at 0 and 1. With `train=False` the running
-    statistics normalise.
+    `train=True` normalises by the mean and the biased variance of the batch, with gradients
+    through both. It sets the running statistics to 0.9 running + 0.1 batch, with the unbiased
+    variance of the batch (count - 1; biased if there is only one value). That needs
+    `mutable=["statistics"]`; `init` leaves them at 0 and 1. `train=False` normalises by the
+    running statistics.
     """
 
     features: int
@@ -105,6 +105,6 @@ class BatchNorm(nn.Module):
         return y
 
     def running(self) -> tuple[Array, Array]:
-        """Factor and shift: what `train=False` does is x * factor + shift."""
+        """Factor and shift of `train=False`, which computes x * factor + shift."""
         factor = self.scale * jax.lax.rsqrt(self.var.value + EPSILON)
         return factor, self.bias - self.mean.value * factor

@@ -3,14 +3,14 @@
 No convolution runs at the finer of its two resolutions. A 5 x 5 kernel on pixels is a 3 x 3
 kernel on blocks of 2 x 2 pixels, so
 
-    convolve, then take the maximum of 2 x 2   = one 3 x 3 convolution of blocks with 4 phases
-                                                 out, and the maximum of the phases
-    repeat every pixel 2 x 2, then convolve    = one 3 x 3 convolution with 4 phases out
+    convolve, then take the maximum of 2 x 2   = one 3 x 3 convolution of blocks with 4 output
+                                                 phases, and the maximum of the phases
+    repeat every pixel 2 x 2, then convolve    = one 3 x 3 convolution with 4 output phases
 
-and both give what the 5 x 5 kernel gives, zero padding included. The second needs 2.8 times
-fewer multiplications; the first a few more, but in wider products and without a window
-reduction, whose gradient is slow. Kernels keep the official layout `[5, 5, in, out]` (it is
-what AGC and the initial scale are defined on) and are rearranged at every use.
+and both give the results of the 5 x 5 kernel, including zero padding. The second needs 2.8
+times fewer multiplications. The first needs a few more, but in wider products and without a
+window reduction, whose gradient is slow. Kernels keep the official layout `[5, 5, in, out]`,
+on which AGC and the initial scale are defined, and are rearranged at every use.
 
 Images are `[N, H, W, C]`. Phases are the last axis but one, row-major: (0, 0), (0, 1), (1, 0),
 (1, 1) of (row, column) within a block.
@@ -32,11 +32,11 @@ from vawm.types import Array
 TAPS = 5  # rows and columns of a kernel
 STAGE_WIDTHS = (2, 3, 4, 4)  # channels of the encoder's stages, in units of `depth`
 HALVINGS = len(STAGE_WIDTHS)
-IMAGES_AT_ONCE = 16  # so that what a product reads stays in the cache
+IMAGES_AT_ONCE = 16  # such that the inputs of a product stay in the cache
 
 
 def _pooled_taps() -> np.ndarray:
-    """`[out phase, block, in phase, tap]`: which tap meets a pixel, in one dimension.
+    """`[out phase, block, in phase, tap]`: 1 for the tap that meets a pixel, in one dimension.
 
     Output pixel p of block 0 sees pixel q of block b (-1, 0, 1) through tap 2 b + q - p + 2.
     """
@@ -49,7 +49,7 @@ def _pooled_taps() -> np.ndarray:
 
 
 def _repeated_taps() -> np.ndarray:
-    """`[out phase, pixel, tap]`: which taps meet a pixel that is repeated twice.
+    """`[out phase, pixel, tap]`: 1 for the taps that meet a pixel that is repeated twice.
 
     Output pixel p of the pair 0 sees pixel (p + tap - 2) // 2, counted from -1, through `tap`.
     """
@@ -93,7 +93,7 @@ def from_phases(x: Array) -> Array:
 
 
 def convolve(x: Array, kernel: Array) -> Array:
-    """`[N, H, W, in]` with `[3, 3, in, 4 out]`, zeros around -> `[N, H, W, 4, out]`."""
+    """`[N, H, W, in]` with `[3, 3, in, 4 out]`, zero padding -> `[N, H, W, 4, out]`."""
     x = convolve_3x3(x, kernel)
     return x.reshape(*x.shape[:3], 4, -1)
 
@@ -106,11 +106,11 @@ def plain_convolve_3x3(x: Array, kernel: Array) -> Array:
 
 @jax.custom_vjp
 def convolve_3x3(x: Array, kernel: Array) -> Array:
-    """`[N, H, W, in]` with `[3, 3, in, out]`, zeros around -> `[N, H, W, out]`.
+    """`[N, H, W, in]` with `[3, 3, in, out]`, zero padding -> `[N, H, W, out]`.
 
-    The gradient of the kernel is a sum over all pixels of all images. On CPU it is a product
-    of matrices here, one per row of the kernel: from pixels, a whole update takes half the
-    time that it takes with XLA's convolution there.
+    The gradient of the kernel is a sum over all pixels of all images. On CPU it is computed
+    by matrix products, one per row of the kernel: a whole update from pixels takes half the
+    time that it takes with XLA's convolution.
     """
     return plain_convolve_3x3(x, kernel)
 
@@ -137,11 +137,11 @@ convolve_3x3.defvjp(_forward, _backward)
 
 
 def kernel_gradient_by_products(x: Array, gradient: Array) -> Array:
-    """What `kernel[r, s]` meets, `[3, 3, in, out]`, a few images at a time.
+    """The gradient of the kernel, `[3, 3, in, out]`, computed a few images at a time.
 
         sum over n, i, j of x[n, i + r - 1, j + s - 1, :, None] * gradient[n, i, j, None, :]
 
-    With rows outermost, rows shifted by r are a slice, and shifts by s go side by side.
+    With rows as the first axis, rows shifted by r are a slice; shifts by s are concatenated.
     """
     count, height, width, inputs = x.shape
     outputs, few = gradient.shape[-1], math.gcd(count, IMAGES_AT_ONCE)
@@ -207,7 +207,7 @@ class Double(nn.Module):
 
 
 class ImageEncoder(nn.Module):
-    """DreamerV3's CNN: four halvings, then all that is left as one vector.
+    """DreamerV3's CNN: four halvings, then the rest flattened to a vector.
 
     `[N, size, size, C]` floats -> `[N, (size / 16)^2 * 4 * depth]`.
     """

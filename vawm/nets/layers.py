@@ -3,9 +3,9 @@
 Every hidden layer is Linear -> RMSNorm -> SiLU with biases, initialised as the official
 DreamerV3 code does. Parameters are float32; products run in `dtype`, norms in float32.
 
-Inputs that are concatenations are passed as tuples and never concatenated: a product with
-[x, y] is x @ W[:m] + y @ W[m:]. It saves copying wide features, and lets a caller compute
-the part of a layer that does not depend on a recurrence outside of the time loop.
+Inputs that are concatenations are passed as tuples and never concatenated: the product with
+[x, y] is x @ W[:m] + y @ W[m:]. This avoids copying wide features, and a caller can compute
+the part of a layer that does not depend on the recurrence outside the time loop.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def rms_norm(x: Array, scale: Array, axes: int | tuple[int, ...] = -1) -> Array:
 
 
 class Linear(nn.Module):
-    """y = x @ W + b of the concatenation of its inputs."""
+    """y = x @ W + b, with x the concatenation of the inputs."""
 
     in_features: int
     out_features: int
@@ -92,7 +92,7 @@ class MLP(nn.Module):
     """`layers` hidden layers and one linear output per entry of `outputs`.
 
     `outputs` are widths, `scales` the initial scales of their kernels (0 for zeros).
-    Without outputs the last hidden layer is returned, otherwise a tuple of outputs.
+    Returns a tuple of outputs, or the last hidden layer if there are no outputs.
     """
 
     in_features: int

@@ -18,10 +18,10 @@ class BlockGRU(nn.Module):
         reset, candidate, update = V_k y_k                       within block k
         h' = u * tanh(r * candidate) + (1 - u) * h,   u = sigmoid(update - 1)
 
-    h travels as `[blocks, N, deter / blocks]`, so block products need no transposition,
+    h is stored as `[blocks, N, deter / blocks]`, so block products need no transposition,
     and the product with x is one dense matrix for all blocks instead of a copy of x per
-    block. Kernels keep the official layout `[blocks, in, out]` (it is what AGC and the
-    initial scale, whose fan-in is the full input width, are defined on).
+    block. Kernels keep the official layout `[blocks, in, out]`, on which AGC and the initial
+    scale (whose fan-in is the full input width) are defined.
     """
 
     deter: int
@@ -60,10 +60,10 @@ class BlockGRU(nn.Module):
         return blocks.swapaxes(0, 1).reshape(blocks.shape[1], -1)
 
     def drive(self, action: Array) -> Array:
-        """What the action adds to the mixing layer, bias included: `[..., D]`.
+        """The contribution of the action to the mixing layer, including bias: `[..., D]`.
 
-        Does not depend on the state, so a caller that knows all actions of a sequence
-        computes it outside of the time loop.
+        Does not depend on the state, so a caller with all actions of a sequence can compute
+        it outside the time loop.
         """
         magnitude = jnp.maximum(1.0, jnp.abs(action))
         action = action / jax.lax.stop_gradient(magnitude)
@@ -77,7 +77,7 @@ class BlockGRU(nn.Module):
         return kernel.swapaxes(0, 1).reshape(kernel.shape[1], self.deter)
 
     def __call__(self, blocks: Array, deter: Array, stoch: Array, drive: Array) -> Array:
-        """One step. `deter` is `blocks`, flat; returns the next blocks."""
+        """One step; `deter` is the flat form of `blocks`. Returns the next blocks."""
         width = self.deter // self.blocks
         x = jnp.concatenate([self.from_deter(deter), self.from_stoch(stoch)], -1)
         x = self.to_blocks(x @ self._shared_kernel(0, 2 * self.hidden) + drive)
@@ -119,7 +119,7 @@ class RSSM(nn.Module):
         )
 
     def read_tokens(self, tokens: Array) -> Array:
-        """The part of the posterior's first layer that reads o_t, bias included."""
+        """The part of the posterior's first layer that reads o_t, including bias."""
         linear = self.posterior_layer.linear
         return linear.add_bias(linear.rows(tokens, self.deter))
 
@@ -133,14 +133,14 @@ class RSSM(nn.Module):
         return self._to_logits(self.prior_net(deter)[0])
 
     def advance(self, deter: Array, stoch: Array, drive: Array) -> Array:
-        """h_{t+1} of flat h_t: the recurrence, for a caller that carries h flat."""
+        """The recurrence from flat h_t to flat h_{t+1}."""
         blocks = self.gru(self.gru.to_blocks(deter), deter, stoch, drive)
         return self.gru.from_blocks(blocks)
 
     def imagine(
         self, blocks: Array, deter: Array, stoch: Array, drive: Array
     ) -> tuple[Array, Array, Array]:
-        """The recurrence and the prior: next blocks, the same flat, and logits."""
+        """The recurrence and the prior: the next h in blocks, flat h, and the prior logits."""
         blocks = self.gru(blocks, deter, stoch, drive)
         deter = self.gru.from_blocks(blocks)
         return blocks, deter, self.prior(deter)

@@ -1,4 +1,4 @@
-"""Linear layers and MLPs as STORM has them: LayerNorm, ReLU, the initial values of PyTorch.
+"""STORM's linear layers and MLPs: LayerNorm, ReLU, and PyTorch's initialisation.
 
 Parameters are float32; products run in `dtype`, norms in float32. Inputs that are
 concatenations are passed as tuples, as in `vawm.nets.layers`.
@@ -46,7 +46,7 @@ class LayerNorm(nn.Module):
 
 
 class UniformLinear(nn.Module):
-    """y = x @ W, or x @ W + b, of the concatenation of its inputs."""
+    """y = x @ W, or x @ W + b, with x the concatenation of the inputs."""
 
     in_features: int
     out_features: int
@@ -74,7 +74,7 @@ class UniformLinear(nn.Module):
 class ReluMLP(nn.Module):
     """`layers` of Linear -> LayerNorm -> ReLU, and one linear output per entry of `outputs`.
 
-    Without outputs the last hidden layer is returned, otherwise a tuple of outputs.
+    Returns a tuple of outputs, or the last hidden layer if there are no outputs.
     """
 
     in_features: int

@@ -1,29 +1,29 @@
 """STORM's encoder and decoder of images: 4 x 4 convolutions of stride 2 and batch norms.
 
-Four halvings, Conv -> BatchNorm -> ReLU, and their mirror image. Of both convolutions the
-padding is 1 and the side even, so a fine image of side 2 s and a coarse one of side s:
+Four halvings, Conv -> BatchNorm -> ReLU, and their mirror image. Both convolutions have padding
+1 and even sides, so between a fine image of side 2 s and a coarse one of side s:
 
     halve    coarse[i] = sum over t of  fine[2 i + t - 1] kernel[t],  t = 0..3, zeros outside
     double   fine[2 i + t - 1] += coarse[i] kernel[t]
 
-in both dimensions. Each is the other's gradient with respect to its input, and they share the
-gradient of the kernel. Kernels are `[4, 4, in, out]`, of rows and columns t as above. From
-torch: `weight.transpose(2, 3, 1, 0)` of a Conv2d, and `.transpose(2, 3, 0, 1)` of a
+in both dimensions. Each is the gradient of the other with respect to its input, and the
+gradient of the kernel is the same. Kernels are `[4, 4, in, out]`, with rows and columns t as
+above. From torch: `weight.transpose(2, 3, 1, 0)` of a Conv2d, and `.transpose(2, 3, 0, 1)` of a
 ConvTranspose2d.
 
-XLA's convolutions are slow on CPU, their gradients more so, and most of all in loops. There,
-both are products of matrices, of a few images at a time so that they stay in the cache.
-A 4 x 4 kernel of stride 2 is a 2 x 2 kernel of stride 1 on blocks of 2 x 2 pixels, and two
-neighbouring results of a kernel of two taps take three products (Winograd, "Arithmetic
-Complexity of Computations", 1980), where written out they take four:
+XLA's convolutions are slow on CPU, their gradients are slower, and both are slowest in loops.
+So on CPU both are computed by matrix products, a few images at a time such that they stay in
+the cache. A 4 x 4 kernel of stride 2 is a 2 x 2 kernel of stride 1 on blocks of 2 x 2 pixels.
+Two neighbouring results of a kernel with two taps take three products (Winograd, "Arithmetic
+Complexity of Computations", 1980) instead of four:
 
     a u + b v = (a - b) u + b (u + v)
     b u + c v = b (u + v) - (b - c) v
 
-In two dimensions that is 9 products for 16. What is read and written in between is less, too,
-than the patches of a product that is written out. Sums come first, so rounding errors are a
-little larger, about 1e-6 of the largest value. Images of few channels, and those whose coarse
-side is odd, are written out. Elsewhere XLA's convolutions do it.
+In two dimensions this needs 9 products instead of 16, and the intermediate arrays are smaller
+than the patches of a direct product. Sums are computed before products, so rounding errors are
+slightly larger, about 1e-6 of the largest value. Images with few channels or an odd coarse side
+use a direct product. Other devices use XLA's convolutions.
 
 Images are `[N, H, W, C]`.
 """
@@ -45,12 +45,12 @@ from vawm.types import Array
 TAPS = 4  # rows and columns of a kernel
 STAGE_WIDTHS = (1, 2, 4, 8)  # channels of the encoder's stages, in units of `depth`
 HALVINGS = len(STAGE_WIDTHS)
-IMAGES_AT_ONCE = 32  # so that what a product reads stays in the cache
-FEW_CHANNELS = 16  # of the fine image; below, products are written out
+IMAGES_AT_ONCE = 32  # such that the inputs of a product stay in the cache
+FEW_CHANNELS = 16  # of the fine image; below, a direct product is used
 LAYOUT = ("NHWC", "HWIO", "NHWC")
 
 
-# Elsewhere than on CPU: convolutions.
+# On other devices than CPU: convolutions.
 
 
 def plain_halve(x: Array, kernel: Array) -> Array:
@@ -70,16 +70,16 @@ def plain_double(x: Array, kernel: Array) -> Array:
     )
 
 
-# On CPU: products of matrices.
-# A scheme says which matrices stand for the fine image, the coarse one and the kernel
+# On CPU: matrix products.
+# A scheme defines matrices for the fine image, the coarse one and the kernel
 # `[4, 4, fine channels, coarse channels]`:
 #
 #     coarse = from_products(fine_k @ kernel_k)         over k
 #     fine   = from_products(coarse_k @ kernel_k^T)
 #     kernel = from_products(fine_k^T @ coarse_k)
 #
-# with rows for pixels (or tiles of them) and columns for channels. `to_...` and the
-# `from_...` of the same thing are transposes of each other.
+# with rows for pixels (or tiles of them) and columns for channels. `to_...` and `of_...` of the
+# same array are transposes of each other.
 
 Matrices = list[Array]
 
@@ -100,13 +100,13 @@ def scheme_of(fine_channels: int, height: int, width: int) -> Scheme:
 
 
 def shifted(x: Array, axis: int, by: int) -> Array:
-    """`x` with one more along `axis`, a zero: first if `by` is 1, else last."""
+    """`x` with one more zero along `axis`: first if `by` is 1, else last."""
     pads = [(0, 0)] * x.ndim
     pads[axis] = (by, 1 - by)
     return jnp.pad(x, pads)
 
 
-# Written out: one product, of all 4 x 4 pixels that a coarse pixel meets.
+# WRITTEN_OUT: one direct product of all 4 x 4 pixels that a coarse pixel meets.
 
 
 def patches(fine: Array) -> Matrices:
@@ -146,8 +146,8 @@ def from_pixels(products: Matrices, count: int, height: int, width: int) -> Arra
     return products[0].reshape(count, height, width, -1)
 
 
-# Saving: nine products, k = (row, column) in 3 x 3, of tiles of 2 x 2 coarse pixels and the
-# 3 x 3 blocks of 2 x 2 fine pixels that they meet, of which tiles share the outer ones.
+# SAVING: nine products, k = (row, column) in 3 x 3, of tiles of 2 x 2 coarse pixels and the
+# 3 x 3 blocks of 2 x 2 fine pixels that they meet; neighbouring tiles share the outer blocks.
 
 
 def differences(a: Array, b: Array, c: Array) -> Matrices:
@@ -158,7 +158,7 @@ def tiles_of_blocks(fine: Array) -> Matrices:
     count, height, width, channels = fine.shape
     height, width = height // 4, width // 4
     x = jnp.pad(fine, ((0, 0), (1, 3), (1, 3), (0, 0)))
-    # The two columns of a block and their channels lie side by side already.
+    # The two columns of a block and their channels are already adjacent.
     x = x.reshape(count, height + 1, 4, width + 1, 2, 2 * channels)
 
     def pair(row: int, block: int) -> Array:  # row 0..5 and column of blocks 0..2 of all tiles
@@ -190,7 +190,7 @@ def add_tiles_of_blocks(products: Matrices, count: int, height: int, width: int)
     columns = [outer_and_middle(1, *entries[j::3]) for j in range(3)]
     rows = zip(*columns, strict=True)
     blocks = [outer_and_middle(2, *row) for row in rows]
-    # For each of a tile's four pixels: outer block or middle, first or next, phase.
+    # For each of a tile's four pixels: outer or middle block, first or next, phase.
     places = ((0, 0, 1), (1, 0, 0), (1, 0, 1), (0, 1, 0))
 
     def pixel(i: int, j: int) -> Array:
@@ -255,7 +255,7 @@ SAVING = Scheme(
 
 
 def scan_images(step: Callable, start: Any, *images: Array) -> tuple[Any, Array]:
-    """`step(total, *some images) -> (total, images)`, through all images, a few at a time."""
+    """Scans `step(total, *some images) -> (total, images)` over images, a few at a time."""
     count = images[0].shape[0]
     loops = count // IMAGES_AT_ONCE
     if loops * IMAGES_AT_ONCE == count and loops > 1:
@@ -272,7 +272,7 @@ def scan_images(step: Callable, start: Any, *images: Array) -> tuple[Any, Array]
 
 
 def map_images(function: Callable[[Array], Array], images: Array) -> Array:
-    """`function` of all images, a few at a time."""
+    """Applies `function` to all images, a few at a time."""
     nothing = jnp.zeros(())
     return scan_images(lambda nothing, few: (nothing, function(few)), nothing, images)[1]
 
@@ -402,12 +402,12 @@ class Stage(nn.Module):
         self.norm = BatchNorm(self.outputs)
 
     def __call__(self, x: Array) -> Array:
-        """In training, by the batch's statistics, which the running ones take in."""
+        """For training: normalises by the batch's statistics and updates the running ones."""
         x = self.convolve(x, self.kernel.astype(self.dtype))
         return nn.relu(self.norm(x, train=True))
 
     def frozen(self) -> tuple[Array, Array]:
-        """Kernel and bias that do with the running statistics what both do together."""
+        """Kernel and bias that combine convolution and norm, with the running statistics."""
         factor, shift = self.norm.running()
         kernel = self.kernel * factor.reshape(1, 1, 1, -1)
         return kernel.astype(self.dtype), shift.astype(self.dtype)
@@ -431,7 +431,7 @@ def to_unit(pixels: Array, dtype: jnp.dtype) -> Array:
 
 
 def encode(layers: Sequence[tuple[Array, Array]], pixels: Array) -> Array:
-    """ReLU(halve(x, kernel) + bias) through all layers; from bytes, which are small."""
+    """ReLU(halve(x, kernel) + bias) through all layers; starts from uint8, to save memory."""
     x = to_unit(pixels, layers[0][0].dtype)
     for kernel, bias in layers:
         x = nn.relu(halve(x, kernel) + bias.reshape(1, 1, 1, -1))
@@ -439,7 +439,7 @@ def encode(layers: Sequence[tuple[Array, Array]], pixels: Array) -> Array:
 
 
 def decode(layers: Sequence[tuple[Array, Array]], z: Array) -> Array:
-    """A map `kernel` of `[F, side, side, C]` makes of z, then doublings; no last ReLU."""
+    """A map from z by the first kernel `[F, side, side, C]`, then doublings; no last ReLU."""
     (kernel, bias), *doublings = layers
     x = (z @ kernel.reshape(z.shape[-1], -1)).reshape(-1, *kernel.shape[1:])
     x = x + bias.reshape(1, 1, 1, -1)
@@ -449,12 +449,12 @@ def decode(layers: Sequence[tuple[Array, Array]], z: Array) -> Array:
 
 
 class StridedEncoder(nn.Module):
-    """STORM's CNN: four halvings, then all that is left as one vector.
+    """STORM's CNN: four halvings, then the rest flattened to a vector.
 
-    `[N, size, size, channels]` pixels from 0 to 255, as bytes or floats, of which it reads
-    pixels / 255 -> `[N, (size / 16)^2 * 8 * depth]`, in order of rows, columns, channels.
+    `[N, size, size, channels]` pixels from 0 to 255, as uint8 or floats, which it divides by
+    255 -> `[N, (size / 16)^2 * 8 * depth]`, in the order rows, columns, channels.
     `train=True` normalises by the statistics of the batch and needs `mutable=["statistics"]`;
-    `train=False` takes the running ones. Source: `EncoderBN` of weipu-zhang/STORM. Raises
+    `train=False` uses the running ones. Source: `EncoderBN` of weipu-zhang/STORM. Raises
     ValueError unless sides are multiples of 16.
     """
 
@@ -481,12 +481,12 @@ class StridedEncoder(nn.Module):
 
 
 class StridedDecoder(nn.Module):
-    """STORM's decoder: a small map from z, then four doublings; the last has a bias alone.
+    """STORM's decoder: a small map from z, then four doublings; the last has only a bias.
 
     `[N, features]` -> `[N, size, size, channels]`, unbounded, the mean of pixels / 255.
     Linear without bias -> BatchNorm -> ReLU makes the map `[size / 16, size / 16, 8 * depth]`.
-    `train` is as in StridedEncoder. Source: `DecoderBN` of weipu-zhang/STORM, whose
-    transposed convolutions draw kernels by the fan-in torch gives them: 16 times outputs.
+    `train` is as in StridedEncoder. Source: `DecoderBN` of weipu-zhang/STORM. Kernels of its
+    transposed convolutions are initialised with torch's fan-in, 16 * outputs.
     Raises ValueError unless `size` is a multiple of 16.
     """
 
@@ -529,7 +529,7 @@ class StridedDecoder(nn.Module):
 
 
 def side_of_map(size: int) -> int:
-    """The side of what is left of an image after all halvings."""
+    """The side of an image after all halvings."""
     side, rest = divmod(size, 2**HALVINGS)
     if rest or not side:
         raise ValueError(f"image sides are multiples of {2**HALVINGS}, got {size}")

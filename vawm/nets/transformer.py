@@ -4,9 +4,9 @@
     in every block   e <- LN(e + dropout(W attention(e)))        causal, dropout on its weights
                      e <- LN(e + dropout(V relu(U e)))
 
-A sequence is read at once, `[B, L, D]`, or one step at a time from a cache, which holds the
-keys and values themselves (the official code keeps the inputs and projects all of them again
-in every step; the numbers are the same).
+A sequence is read at once, `[B, L, D]`, or one step at a time with a cache of keys and values.
+(The official code caches the inputs and projects all of them again in every step, with the same
+results.)
 """
 
 from __future__ import annotations
@@ -21,30 +21,30 @@ import jax.numpy as jnp
 from vawm.nets.relu import LayerNorm, UniformLinear
 from vawm.types import Array
 
-BLOCK_EPSILON = 1e-6  # of the norms in here; the others have `relu.NORM_EPSILON`
-HIDDEN = -1e30  # the score of what must not be attended to
+BLOCK_EPSILON = 1e-6  # of the norms in this module; others use `relu.NORM_EPSILON`
+HIDDEN = -1e30  # score of steps that must not be attended to
 
 
 class Cache(NamedTuple):
-    """Keys and values of N sequences in a fixed number of slots, of which the first are in use.
+    """Keys and values of N sequences in a fixed number of slots; the first `length` are in use.
 
-    A step that finds no free slot is lost: there have to be enough.
-    Slots are the first axis: a step reads only those in use, each in one piece.
+    A step without a free slot is lost, so there must be enough slots. Slots are the first
+    axis, so that a step reads only those in use, each from contiguous memory.
     """
 
     keys: tuple[Array, ...]  # of each block, [slots, N, heads, D / heads]
     values: tuple[Array, ...]
     length: Array  # [] int32, slots in use
-    visible: Array  # [slots, N] bool, which of them may be attended to
+    visible: Array  # [slots, N] bool, which slots may be attended to
 
 
 def causal(length: int) -> Array:
-    """`[1, L, L]`: step q sees step k <= q."""
+    """The causal mask `[1, L, L]`: step q sees steps k <= q."""
     return jnp.tril(jnp.ones((1, length, length), bool))
 
 
 def attend(query: Array, key: Array, value: Array, visible: Array, dropout) -> Array:
-    """`[B, L, heads, d]` three times, `[B or 1, L, L]` -> `[B, L, heads * d]`."""
+    """Attention: three `[B, L, heads, d]`, mask `[B or 1, L, L]` -> `[B, L, heads * d]`."""
     f32 = jnp.float32
     scores = jnp.einsum("bqhd,bkhd->bhqk", query, key, preferred_element_type=f32)
     scores = jnp.where(visible[:, None], scores / math.sqrt(query.shape[-1]), HIDDEN)
@@ -56,10 +56,10 @@ def attend(query: Array, key: Array, value: Array, visible: Array, dropout) -> A
 def attend_cached(
     query: Array, keys: Array, values: Array, visible: Array, length: Array
 ) -> Array:
-    """One query `[N, heads, d]` against the slots in use -> `[N, heads * d]`.
+    """Attention of one query `[N, heads, d]` to the slots in use -> `[N, heads * d]`.
 
-    On a CPU the slots are gone through one by one, with a running softmax: a product for each
-    of N * heads tiny matrices takes several times as long, and would read every slot.
+    On a CPU it loops over the slots with a running softmax: products of N * heads tiny
+    matrices take several times as long, and would read every slot.
     """
     arguments = query, keys, values, visible, length
     mixed = jax.lax.platform_dependent(
@@ -71,7 +71,7 @@ def attend_cached(
 def attend_at_once(
     query: Array, keys: Array, values: Array, visible: Array, length: Array
 ) -> Array:
-    """`[N, heads, d]` float32."""
+    """`attend_cached` with matrix products; `[N, heads, d]` float32."""
     f32 = jnp.float32
     scores = jnp.einsum("nhd,snhd->nhs", query, keys, preferred_element_type=f32)
     used = jnp.arange(keys.shape[0]) < length
@@ -84,7 +84,7 @@ def attend_at_once(
 def attend_slot_by_slot(
     query: Array, keys: Array, values: Array, visible: Array, length: Array
 ) -> Array:
-    """As `attend_at_once`: sums are kept relative to the largest score so far."""
+    """`attend_at_once` in a loop; sums are kept relative to the largest score so far."""
     query = query.astype(jnp.float32) / math.sqrt(query.shape[-1])
 
     def add(slot, sums: tuple[Array, Array, Array]):
@@ -104,7 +104,7 @@ def attend_slot_by_slot(
 
 
 class Block(nn.Module):
-    """Attention and feed-forward layer, each added to its input and normalised after that."""
+    """Attention and feed-forward layer, each added to its input and then normalised."""
 
     width: int
     heads: int
@@ -123,12 +123,12 @@ class Block(nn.Module):
         self.drop = nn.Dropout(self.dropout)
 
     def project(self, x: Array) -> list[Array]:
-        """Queries, keys and values, `[..., heads, D / heads]` each."""
+        """Queries, keys and values, each `[..., heads, D / heads]`."""
         parts = jnp.split(self.qkv(x), 3, axis=-1)
         return [part.reshape(*part.shape[:-1], self.heads, -1) for part in parts]
 
     def add(self, x: Array, mixed: Array, deterministic: bool) -> Array:
-        """What follows attention."""
+        """The rest of the block after attention."""
         x = self.attention_norm(x + self.drop(self.out(mixed), deterministic))
         wide = nn.relu(self.wide(x))
         return self.feedforward_norm(x + self.drop(self.narrow(wide), deterministic))
@@ -136,7 +136,7 @@ class Block(nn.Module):
     def __call__(
         self, x: Array, visible: Array, deterministic: bool, asked: slice = slice(None)
     ):
-        """What the steps `asked` become, and keys and values of all."""
+        """The outputs of the steps `asked`, and the keys and values of all steps."""
         query, key, value = self.project(x)
         mixed = attend(
             query[:, asked],
@@ -149,9 +149,9 @@ class Block(nn.Module):
 
 
 class Transformer(nn.Module):
-    """`blocks` of them after the positions.
+    """Adds positions, then applies `blocks` blocks.
 
-    Dropout takes the random numbers "dropout", unless `deterministic`.
+    Dropout uses the random numbers "dropout", unless `deterministic`.
     """
 
     width: int
@@ -187,19 +187,19 @@ class Transformer(nn.Module):
 
         Args:
           x: mixed latents and actions.
-          visible: `[B or 1, L, L]`, which step (last axis) each step sees.
+          visible: `[B or 1, L, L]`, the steps (last axis) that each step sees.
           deterministic: without dropout.
-          asked: the steps whose output is wanted; the last block works for no other.
+          asked: the steps whose output is needed; the last block computes no other.
 
         Returns:
           `[B, steps asked, D]`, and the keys and values of each block,
           `[B, L, heads, D / heads]`.
 
         Raises:
-          ValueError: there are more steps than positions.
+          ValueError: more steps than positions.
         """
         if x.shape[1] > self.positions:
-            raise ValueError(f"{x.shape[1]} steps, {self.positions} positions")
+            raise ValueError(f"{x.shape[1]} steps, but only {self.positions} positions")
         x = self.place(x, self.position[: x.shape[1]])
         keys, values = [], []
         for block in self.layers:
@@ -225,13 +225,13 @@ class Transformer(nn.Module):
 
 
 def fill(keys: list[Array], values: list[Array], visible: Array, *, slots: int) -> Cache:
-    """A cache of sequences that were read at once.
+    """A cache with sequences that were read at once.
 
     Args:
       keys: of each block, `[N, L, heads, D / heads]`.
       values: the same.
       visible: `[N, L]`, which steps may be attended to from now on.
-      slots: L, and as many steps as are to follow.
+      slots: L plus the number of steps that will follow.
     """
     length = keys[0].shape[1]
 
@@ -289,7 +289,7 @@ class Storm(nn.Module):
         return self._to_logits(self.prior_out(deter))
 
     def mix(self, stoch: Array, action: Array) -> Array:
-        """e_t of flat z_t and a_t. Continuous actions beyond 1 are scaled down to it."""
+        """e_t from flat z_t and a_t; scales action entries beyond [-1, 1] to magnitude 1."""
         action = action / jax.lax.stop_gradient(jnp.maximum(1.0, jnp.abs(action)))
         x = nn.relu(self.mix_in_norm(self.mix_in(stoch, action)))
         return self.mix_out_norm(self.mix_out(x))
@@ -301,7 +301,7 @@ class Storm(nn.Module):
         return self.transformer(self.mix(stoch, action), visible, asked=asked)
 
     def read_in_training(self, stoch: Array, action: Array, visible: Array) -> Array:
-        """`[B, L, D]` h, with dropout."""
+        """h `[B, L, D]`, with dropout."""
         return self.transformer(self.mix(stoch, action), visible, deterministic=False)[0]
 
     def step(self, stoch: Array, action: Array, cache: Cache) -> tuple[Array, Cache]:

@@ -1,8 +1,8 @@
-"""Many runs of one program: variants x tasks x seeds, their tables and their figures.
+"""Many runs of one program: variants x tasks x seeds, with tables and figures.
 
-`runs` says which there are and how each is started, `children` keeps some of them going,
-`results` reads what they measured, `figures` draws it, and `ablation` is all of it behind one
-command line. `costs` is the same for time and memory, of which no run is needed.
+`runs` lists the runs and their commands, `children` runs several of them at a time, `results`
+reads their metrics, `figures` draws them, and `ablation` combines everything in one command
+line. `costs` compares time and memory, without whole runs.
 """
 
 from vawm.sweep import ablation, children, costs, figures, results, runs

@@ -1,9 +1,8 @@
-"""One ablation of the paper: its variants, its two scales, and the command line of them all.
+"""One ablation of the paper: its variants, its two scales, and the common command line.
 
-`quick` shows on a CPU that everything works, and how it looks; `paper` has the
-tasks and presets of the paper. Results are `ablation_<name>.csv`, `.md` and `.png`; with
-`_<agent>` for another agent than dreamerv3, `_paper` for that scale, and the tasks if they are
-named.
+The scale `quick` shows on a CPU that everything works; `paper` uses the tasks and presets of
+the paper. Results are `ablation_<name>.csv`, `.md` and `.png`; the name has `_<agent>` for
+another agent than dreamerv3, `_paper` for that scale, and the tasks if they are given.
 """
 
 from __future__ import annotations
@@ -23,14 +22,14 @@ from vawm.sweep.runs import Sweep, Variant
 
 
 class Scale(NamedTuple):
-    """On what the variants are compared, and for how long.
+    """The tasks, seeds and length of the runs of a comparison.
 
     Attributes:
-      suite: whose program trains.
+      suite: the suite whose program trains.
       preset: of that suite.
-      tasks, seeds: as many as are named.
+      tasks, seeds: of the runs.
       env_steps: length of a run; that of the preset if None.
-      flags: further ones, of every run.
+      flags: further flags of every run.
     """
 
     suite: str
@@ -42,28 +41,28 @@ class Scale(NamedTuple):
 
 
 QUICK = Scale("dmc_proprio", "quick", ("cartpole_swingup",), (0, 1, 2), env_steps=40_000)
-"""A third of the preset's run."""
+"""A third of the length of the preset's run."""
 
 TABLE_3 = ("alien", "crazy_climber", "demon_attack", "bank_heist", "battle_zone")
 
 
 def paper(*games: str) -> Scale:
-    """Atari 100k, over the 5 seeds of Tables 1 and 2."""
+    """Games of Atari 100k, with the 5 seeds of Tables 1 and 2."""
     return Scale("atari100k", "paper", games, (0, 1, 2, 3, 4))
 
 
 class Ablation(NamedTuple):
-    """What is compared.
+    """A comparison of variants.
 
     Attributes:
-      name: of its results.
+      name: of the results.
       title: the first sentence of the table.
-      variants: of an agent, or with one of their own; raises `InvalidInput` where it makes no
-        sense for one.
+      variants: `(agent) -> variants`; a variant may set another agent. Raises `InvalidInput`
+        if the ablation does not apply to the agent.
       quick, paper: the two scales.
-      factor: what differs between variants: a heading.
-      extra: column -> metric, of what is drawn over time in `ablation_<name>_curves.png`; the
-        table has means over the last tenth of each run.
+      factor: what differs between variants, as a column heading.
+      extra: column -> metric of further curves in `ablation_<name>_curves.png`; the table
+        has means over the last tenth of each run.
     """
 
     name: str
@@ -89,61 +88,61 @@ OFF = ("--value-alignment.weight", "off")
 
 @dataclass(frozen=True)
 class Compared:
-    """What is compared, and where the results go: the options that all scripts have."""
+    """The options of all scripts: what to compare, and where to put the results."""
 
     scale: Literal["quick", "paper"] = "quick"
-    """quick: for a CPU with 2 cores; paper: its tasks and presets, on a GPU"""
+    """quick: for a CPU with 2 cores; paper: the paper's tasks and presets, for a GPU"""
     agent: str = "dreamerv3"
     tasks: tuple[str, ...] = ()
-    """as many as are named; those of the scale if none"""
+    """one or more tasks; default those of the scale"""
     results: pathlib.Path = pathlib.Path("experiments/results")
 
 
 @dataclass(frozen=True)
 class Options(Compared):
-    """Which runs of an ablation, and where they go."""
+    """The runs of an ablation, and their folder."""
 
     seeds: tuple[int, ...] = ()
-    """those of the scale if none"""
+    """default those of the scale"""
     env_steps: int | None = None
-    """length of every run; that of the scale if not given"""
+    """length of every run; default that of the scale"""
     jobs: int = 1
-    """runs side by side"""
+    """runs at the same time"""
     runs: pathlib.Path = pathlib.Path("runs/ablations")
     collect_only: bool = False
-    """write the results of the runs that are there, and start none"""
+    """write the results of existing runs, and start none"""
 
 
 def main(
     ablation: Ablation, argv: Sequence[str] | None, *, description: str | None, script: str
 ) -> int:
-    """What a script does that compares `ablation`; returns the exit code, 1 if a run failed."""
+    """The main function of a script for `ablation`; returns 1 if a run failed, else 0."""
     default = Options(results=results_folder(script))
     options = flags.read(Options, argv, default=default, description=description)
     return run(ablation, options, script=script)
 
 
 def results_folder(script: str) -> pathlib.Path:
-    """Results go beside the folder of the script, wherever it is started."""
+    """The folder of results, next to the script's folder."""
     return programs_folder(script) / "results"
 
 
 def programs_folder(script: str) -> pathlib.Path:
-    """The programs that train are a folder above the script."""
+    """The folder of the programs that train, above the script's folder."""
     return pathlib.Path(script).resolve().parents[1]
 
 
 def run(ablation: Ablation, options: Options, *, script: str) -> int:
-    """Trains what is missing, then writes the table and the figures; returns the exit code.
+    """Trains the missing runs, then writes table and figures; returns the exit code.
 
     Args:
-      ablation: what is compared.
-      options: which runs, and where they go.
+      ablation: the comparison.
+      options: the runs, and their folder.
       script: the file that was started.
 
     Raises:
       InvalidInput: before anything is started.
-      RunError: matplotlib is missing, or no run has measured anything.
+      RunError: matplotlib is not installed, or no run has any metrics.
     """
     sweep = make_sweep(ablation, options, programs_folder(script))
     check(ablation, options, sweep)
@@ -163,7 +162,7 @@ def make_sweep(ablation: Ablation, options: Options, programs: pathlib.Path) -> 
     """The runs of an ablation.
 
     Raises:
-      InvalidInput: there is no such agent, or the ablation makes no sense for it.
+      InvalidInput: an unknown agent, or one that the ablation does not apply to.
     """
     scale = scale_of(ablation, options)
     validate.check_choice("agent", options.agent, registry.names())
@@ -179,14 +178,14 @@ def make_sweep(ablation: Ablation, options: Options, programs: pathlib.Path) -> 
 
 
 def check(ablation: Ablation, options: Options, sweep: Sweep) -> None:
-    """Refuses what would only fail in every run, or after hours of them."""
+    """Refuses options that would fail in every run, or only after hours."""
     runs.check(sweep, scale_of(ablation, options).suite)
     started = None if options.collect_only else options.runs
     runs.check_places(jobs=options.jobs, runs=started, results=options.results)
 
 
 def result_name(ablation: Ablation, options: Compared) -> str:
-    """Of files and folders."""
+    """The name of the result files and of the folder of runs."""
     agent = "" if options.agent == "dreamerv3" else f"_{options.agent}"
     scale = "" if options.scale == "quick" else f"_{options.scale}"
     tasks = "".join(f"_{task.replace('/', '-')}" for task in options.tasks)
@@ -194,10 +193,10 @@ def result_name(ablation: Ablation, options: Compared) -> str:
 
 
 def write(ablation: Ablation, options: Options, sweep: Sweep, made_by: str) -> str:
-    """Writes table and figures of what is there; returns the table in Markdown.
+    """Writes table and figures of the existing runs; returns the table in Markdown.
 
     Raises:
-      RunError: nothing is.
+      RunError: no run has any metrics.
     """
     columns = results.RETURN | ablation.extra
     rows = results.read_some(sweep, columns)
@@ -219,31 +218,31 @@ def write(ablation: Ablation, options: Options, sweep: Sweep, made_by: str) -> s
 
 
 HOW_TO_READ = (
-    "Returns of the training episodes: mean +- standard error over seeds. The mean return is "
-    "the area under the curve, per environment step. Minutes are of one run."
+    "Returns of training episodes: mean +- standard error over seeds. The mean return is the "
+    "area under the curve per environment step. Minutes are those of one run."
 )
 HOW_TO_READ_EXTRA = (
-    "All other columns: of each run the mean over the last tenth of its environment steps, and "
+    "All other columns: the mean over the last tenth of each run's environment steps, then "
     "over seeds as above."
 )
 
 
 def how_to_read(ablation: Ablation) -> str:
-    """What the columns of its table are."""
+    """Explains the columns of the table."""
     return f"{HOW_TO_READ} {HOW_TO_READ_EXTRA}" if ablation.extra else HOW_TO_READ
 
 
 def setting(agent: str, sweep: Sweep) -> str:
-    """What all runs have in common, but for an agent that a variant names itself."""
+    """What all runs have in common, except for variants that set another agent."""
     if any("--agent" in variant.flags for variant in sweep.variants):
-        agent += " where none is named"
+        agent += " unless stated"
     length = "" if sweep.env_steps is None else f", {sweep.env_steps:,} environment steps"
     preset = sweep.flags[sweep.flags.index("--preset") + 1]
     return f"Agent {agent}, preset {preset} of {sweep.program.name}{length}."
 
 
 def command(options: Compared, script: str) -> str:
-    """The command line that options came from, without what changes no number."""
+    """The command line for these options, without flags that do not change the numbers."""
     words = ["python", "experiments/ablations/" + pathlib.Path(script).name]
     silent = ("jobs", "runs", "results", "collect_only")
     for field in dataclasses.fields(options):

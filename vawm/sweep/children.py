@@ -1,4 +1,4 @@
-"""Child processes side by side; whoever stops their parent stops them too."""
+"""Child processes in parallel, stopped together with their parent."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from typing import NamedTuple
 from vawm.process import signals
 
 POLL_SECONDS = 0.1
-"""Well below `signals.BURST_SECONDS`: a child to which a terminal has sent Ctrl-C already takes
-what follows from here for the same request."""
+"""Well below `signals.BURST_SECONDS`: then a child that already got Ctrl-C from a terminal
+counts the SIGTERM from this process as the same request."""
 
 
 class Job(NamedTuple):
-    """A command, and the file to which all that it prints is appended."""
+    """A command, and the file to which its output is appended."""
 
     name: str
     command: Sequence[str]
@@ -27,11 +27,11 @@ class Job(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """How they ended.
+    """How the jobs ended.
 
     Attributes:
-      failed: jobs that ended by themselves, with another exit code than 0.
-      exit_code: 0, or what a shell expects after the signal that stopped this process.
+      failed: jobs that ended by themselves with an exit code other than 0.
+      exit_code: 0, or the shell's exit code for the signal that stopped this process.
     """
 
     failed: list[tuple[Job, int]]
@@ -39,11 +39,11 @@ class Outcome(NamedTuple):
 
 
 def run(jobs: Sequence[Job], *, at_once: int) -> Outcome:
-    """Keeps `at_once` jobs going, on Linux each with its share of the cores.
+    """Runs `at_once` jobs at a time, on Linux each on its share of the cores.
 
-    At Ctrl-C, SIGTERM or SIGHUP no further one is started; those that run get a SIGTERM, upon
-    which a run of ours saves, and this returns when all have ended. At a second signal
-    this process ends at once, and they go on saving.
+    After Ctrl-C, SIGTERM or SIGHUP it starts no further job and sends SIGTERM to the running
+    ones, which makes a run save and stop. It returns when all have ended. A second signal
+    ends this process at once, while the jobs continue to save.
     """
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
     shares = [cores[i::at_once] for i in range(at_once)]
@@ -67,23 +67,23 @@ def run(jobs: Sequence[Job], *, at_once: int) -> Outcome:
 
 
 def run_then(jobs: Sequence[Job], report: Callable[[], None], *, at_once: int) -> int:
-    """Runs the jobs, then reports, of whichever succeeded; not after a signal.
+    """Runs the jobs, then calls `report`, even if jobs failed, but not after a signal.
 
     Returns:
-      The exit code of a program that does no more: 1 if a job failed.
+      The exit code for the program: 1 if a job failed.
     """
     outcome = run(jobs, at_once=at_once)
     if outcome.exit_code:
-        print("stopped; the same command goes on")
+        print("stopped; run the same command to continue")
         return outcome.exit_code
     for job, code in outcome.failed:
-        print(f"error: {job.name} ended with exit code {code}, see {job.log}", file=sys.stderr)
+        print(f"error: {job.name} failed with exit code {code}; see {job.log}", file=sys.stderr)
     report()
     return 1 if outcome.failed else 0
 
 
 def _ended(running: dict[int, tuple[Job, subprocess.Popen]]) -> list[tuple[Job, int]]:
-    """Takes those that have ended out of `running`; returns which of them failed."""
+    """Removes jobs that have ended from `running`; returns those that failed."""
     failed = []
     for slot, (job, process) in list(running.items()):
         if process.poll() is not None:
@@ -98,7 +98,7 @@ def _start(job: Job, cores: Sequence[int]) -> subprocess.Popen:
     job.log.parent.mkdir(parents=True, exist_ok=True)
     with job.log.open("a") as log:
         process = subprocess.Popen(job.command, stdout=log, stderr=log)
-    if cores:  # threads that it starts from now on inherit them
+    if cores:  # threads that it starts from now on inherit the affinity
         with contextlib.suppress(ProcessLookupError):
             os.sched_setaffinity(process.pid, cores)
     return process

@@ -1,4 +1,4 @@
-"""What a variant costs beside another: a table of time and memory, and its figure."""
+"""Compares the cost of variants: a table of time and memory, and its figure."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ GIB = 2**30
 
 @dataclass(frozen=True)
 class Options(Compared):
-    """What is measured, and where it goes."""
+    """What to measure, and where to put the results."""
 
     repeats: int = 20
-    """timed samples of each variant"""
+    """timed samples per variant"""
 
 
 def main(
     compared: Ablation, argv: Sequence[str] | None, *, description: str | None, script: str
 ) -> int:
-    """What a script does that measures two variants: the first, and what it is more than."""
+    """The main function of a script that measures the first variant against the second."""
     default = Options(results=ablation.results_folder(script))
     options = flags.read(Options, argv, default=default, description=description)
     check_positive("repeats", options.repeats)
     given = {field.name: getattr(options, field.name) for field in dataclasses.fields(Compared)}
-    runs_of_it = ablation.Options(**given)  # of which none is started
+    runs_of_it = ablation.Options(**given)  # to check the options; starts no run
     sweep = ablation.make_sweep(compared, runs_of_it, ablation.programs_folder(script))
     suite = ablation.scale_of(compared, options).suite
     runs.check(sweep, suite)
@@ -61,7 +61,7 @@ def main(
 
 
 def rows_of(owned: Sequence[Run], measured: Sequence[Measured]) -> Rows:
-    """A row per variant; what it takes more is more than the last one takes."""
+    """A row per variant; overheads are relative to the last variant."""
     rows, base = [], measured[-1]
     for run, own in zip(owned, measured, strict=True):
         first, third = quartiles(own.seconds)
@@ -90,16 +90,16 @@ def rows_of(owned: Sequence[Run], measured: Sequence[Measured]) -> Rows:
 
 
 HOW_TO_READ = (
-    "A sample is the smallest number of whole steps in which no part of an update is owed. "
-    "Medians, and in brackets quartiles over the samples; the overhead is that of a sample "
-    "over its neighbour of the other variant. Hours of a whole run follow from the median. "
-    "Peak memory is that of the accelerator; on a CPU it is what XLA has planned for a step: "
-    "arguments, results and temporaries."
+    "A sample is the smallest number of training steps with a whole number of updates. Numbers "
+    "are medians, with quartiles over the samples in brackets. The overhead compares each "
+    "sample with the neighbouring sample of the other variant. Hours of a whole run follow "
+    "from the median. Peak memory is that of the accelerator; on a CPU, it is XLA's plan for a "
+    "step: arguments, results and temporaries."
 )
 
 
 def markdown(rows: Rows, *, notes: str, command: str) -> str:
-    """The table, what it is of, and what made it."""
+    """The table in Markdown, with its explanation and its command."""
     heads = ["task", "value alignment", "s per sample", "overhead", "peak memory", "hours"]
     lines = [notes, "", HOW_TO_READ, "", line(heads), line(["---"] * len(heads))]
     base = rows[-1]["variant"]
@@ -116,7 +116,7 @@ def markdown(rows: Rows, *, notes: str, command: str) -> str:
             values[1], values[2] = "-", f"{row['peak_gib']:.2f} GiB"
         lines.append(line([row["task"], row["variant"], *values]))
     sample = "; ".join(
-        f"{row['task']}: {row['updates']} updates and {row['env_steps']} environment steps a "
+        f"{row['task']}: {row['updates']} updates and {row['env_steps']} environment steps per "
         f"sample, {row['samples']} samples"
         for row in {row["task"]: row for row in rows}.values()
     )
@@ -124,7 +124,7 @@ def markdown(rows: Rows, *, notes: str, command: str) -> str:
 
 
 def plot(rows: Rows, sweep: Sweep, path: pathlib.Path) -> None:
-    """Seconds of a sample, with quartiles, and peak memory: a group of bars per task."""
+    """Draws seconds per sample, with quartiles, and peak memory: a group of bars per task."""
     width, places = 0.8 / len(sweep.variants), range(len(sweep.tasks))
     with panels(path, 1, 2, size=(4.5, 3.2)) as axes:
         time, memory = axes[0]
@@ -136,9 +136,9 @@ def plot(rows: Rows, sweep: Sweep, path: pathlib.Path) -> None:
             seconds = [row["seconds"] for row in own]
             time.bar(at, seconds, width, yerr=(below, above), label=variant.name)
             memory.bar(at, [row["peak_gib"] for row in own], width, label=variant.name)
-        for panel, what in ((time, "seconds of a sample"), (memory, "peak memory, GiB")):
+        for panel, what in ((time, "seconds per sample"), (memory, "peak memory, GiB")):
             middle = width * (len(sweep.variants) - 1) / 2
             panel.set_xticks([place + middle for place in places], sweep.tasks)
             panel.set(ylabel=what)
-        time.margins(y=0.35)  # the legend stands above the bars
+        time.margins(y=0.35)  # space for the legend above the bars
         time.legend(title="value alignment", ncols=2)

@@ -15,7 +15,7 @@ from vawm.sweep.results import Rows, missing, of_run
 from vawm.sweep.runs import Run, Sweep
 
 OF_MANY_SIZES = ("weight",)
-"""Columns whose axis is linear up to 1 and logarithmic from there on."""
+"""Columns whose axis is linear up to 1 and logarithmic above."""
 
 
 def plot(
@@ -31,14 +31,14 @@ def plot(
     """Draws `rows` of `results.read` and writes a PNG.
 
     Args:
-      rows: what was measured.
-      sweep: whose tasks, variants and seeds these are.
+      rows: the measurements.
+      sweep: the sweep with their tasks, variants and seeds.
       path: of the PNG.
-      quantities: columns, a row of panels for each.
+      quantities: columns, with a row of panels each.
       label: of a variant in the legend, with `{}` for its name.
-      seeds: a line for each; or the mean of those that count in the table, in a band from the
-        lowest to the highest.
-      returns: lower and upper end of the axis of returns; as the data need it if None.
+      seeds: "lines" for a line per seed; "band" for the mean of the seeds in the table, with
+        a band from the lowest to the highest.
+      returns: limits of the axis of returns; from the data if None.
     """
     draw = {"lines": _lines, "band": _band}[seeds]
     with panels(path, len(quantities), len(sweep.tasks), size=(4.5, 3.2)) as axes:
@@ -47,7 +47,7 @@ def plot(
         ):
             for color, variant in enumerate(sweep.variants):
                 owned = [Run(task, variant.name, seed) for seed in sweep.seeds]
-                # In a band, a run that is not over would end the others' curve too.
+                # In a band, an unfinished run would cut off the curves of the others.
                 left_out = [
                     run for run in owned if seeds == "band" and missing(sweep, rows, run)
                 ]
@@ -66,7 +66,7 @@ def plot(
 
 
 def _place(lines: int) -> dict[str, Any]:
-    """Where a legend of so many lines goes: beside the panel if it would hide the curves."""
+    """The place of a legend with this many lines: beside the panel if it is large."""
     return {"loc": "upper left", "bbox_to_anchor": (1, 1)} if lines > 4 else {}
 
 
@@ -78,7 +78,7 @@ def _lines(panel, curves: Sequence[Rows], quantity: str, color: str, label: str)
 
 
 def _band(panel, curves: Sequence[Rows], quantity: str, color: str, label: str) -> None:
-    """A legend tells how many seeds there are where some are missing."""
+    """Draws mean and band; the legend has the number of seeds if some are missing."""
     steps, values = interpolated([rows for rows in curves if rows], quantity)
     if len(values) < len(curves):
         label += f" ({len(values)} of {len(curves)} seeds)"
@@ -89,7 +89,7 @@ def _band(panel, curves: Sequence[Rows], quantity: str, color: str, label: str) 
 
 
 def interpolated(curves: Sequence[Rows], quantity: str) -> tuple[np.ndarray, np.ndarray]:
-    """`aligned` values of a quantity, `[N]` env steps and `[S, N]`; none of no curves."""
+    """`aligned` values of a quantity: `[N]` env steps and `[S, N]`; empty without curves."""
     if not curves:
         return np.zeros(0), np.zeros((0, 0))
     return aligned(

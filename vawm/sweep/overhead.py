@@ -1,9 +1,8 @@
-"""How much longer does a whole training step take, and how much more memory, than another?
+"""Measures how much more time and memory a training step needs than another.
 
-Each variant is a process of its own, and so is its memory. They take their steps in turn,
-so that whatever else the machine does strikes them alike. A sample is as many steps as it takes
-until no part of an update is owed, so each has the same number of updates, with environments,
-replay and all.
+Each variant runs in its own process, with its own memory. They take turns, so that other load
+on the machine affects them equally. A sample is the smallest number of training steps with a
+whole number of updates, including environments and replay.
 
 The process runs `python -m vawm.sweep.overhead SUITE FLAGS...`, with the flags of the programs
 that train. It reports once when it is ready, then times a sample for every line that it reads.
@@ -33,19 +32,19 @@ from vawm.runs.runner import RunError
 from vawm.runs.trainer import Kept, everything
 
 WARM_UP = 2
-"""Samples that are not counted."""
+"""Number of first samples that are not counted."""
 COMMAND = (sys.executable, "-m", "vawm.sweep.overhead")
-"""What measures one variant."""
+"""The command that measures one variant."""
 
 
 class Measured(NamedTuple):
-    """What one variant took.
+    """The time and memory of one variant.
 
     Attributes:
       seconds: of every sample.
       updates, env_steps: in a sample.
       compile_s: the time to compile a step, without a cache.
-      peak_bytes: most memory that was used of the accelerator; on a CPU, `planned_bytes`.
+      peak_bytes: peak memory of the accelerator; on a CPU, `planned_bytes`.
       run_env_steps: of a whole run.
     """
 
@@ -58,7 +57,7 @@ class Measured(NamedTuple):
 
     @property
     def run_hours(self) -> float:
-        """What a whole run would take if all of it were like the median sample."""
+        """Hours of a whole run, extrapolated from the median sample."""
         samples = self.run_env_steps / self.env_steps
         return samples * statistics.median(self.seconds) / 3600
 
@@ -67,11 +66,11 @@ def compare(suite: str, variants: Sequence[Sequence[str]], *, repeats: int) -> l
     """Measures every variant, given as flags of the program of `suite`, `repeats` times.
 
     Raises:
-      RunError: one of them ended before its time.
+      RunError: the process of a variant ended early.
     """
     with contextlib.ExitStack() as stack:
         steppers = []
-        for flags in variants:  # one after the other: compiling uses all cores
+        for flags in variants:  # one by one, because compiling uses all cores
             steppers.append(stack.enter_context(_Stepper(suite, flags)))
         for number in range(WARM_UP + repeats):
             ordered = steppers if number % 2 else steppers[::-1]
@@ -84,7 +83,7 @@ class _Stepper:
     """The process of one variant."""
 
     def __init__(self, suite: str, flags: Sequence[str]):
-        # Two processes share a GPU: neither may take it whole beforehand.
+        # Two processes share a GPU: neither may allocate all of it in advance.
         environment = os.environ | {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
         pipe = subprocess.PIPE
         self._flags, self._seconds = flags, list[float]()
@@ -104,7 +103,7 @@ class _Stepper:
 
     def _ask(self, word: str) -> None:
         assert self._process.stdin is not None
-        with contextlib.suppress(BrokenPipeError):  # the answer will be missing
+        with contextlib.suppress(BrokenPipeError):  # then `_read` raises
             self._process.stdin.write(word + "\n")
             self._process.stdin.flush()
 
@@ -113,7 +112,7 @@ class _Stepper:
         line = self._process.stdout.readline()
         if not line:
             code = self._process.wait()
-            raise RunError(f"measuring {' '.join(self._flags)} ended with exit code {code}")
+            raise RunError(f"measuring {' '.join(self._flags)} failed with exit code {code}")
         return json.loads(line)
 
     def __enter__(self) -> _Stepper:
@@ -125,7 +124,7 @@ class _Stepper:
 
 
 def main(suite: str, flags: Sequence[str], asked: IO[str], answers: IO[str]) -> int:
-    """The process of one variant: answers every line of `asked` with one of JSON."""
+    """The process of one variant: answers every line of `asked` with a line of JSON."""
     config = command_line.parse(flags, suite=suite, description="").config
     validate.check(config)
     suites.check_task(config)
@@ -135,7 +134,7 @@ def main(suite: str, flags: Sequence[str], asked: IO[str], answers: IO[str]) -> 
         step, executables = trainer.compile(state)
         compile_s = time.perf_counter() - begin
         updates = 0
-        while not updates:  # until replay can fill a batch
+        while not updates:  # until replay has enough steps for a batch
             state, metrics = step(state)
             updates = int(metrics["chunk/updates"])
         steps = steps_of_a_sample(config)
@@ -161,29 +160,29 @@ def main(suite: str, flags: Sequence[str], asked: IO[str], answers: IO[str]) -> 
 
 
 def steps_of_a_sample(config: Config) -> int:
-    """The fewest steps after which no part of an update is owed."""
+    """The smallest number of training steps with a whole number of updates."""
     earned = config.num_envs * config.collect_steps * config.train_ratio
     return config.replay.batch_steps // math.gcd(config.replay.batch_steps, earned)
 
 
 def _kept(config: Config) -> Kept:
-    """Without value alignment its metrics are not computed either."""
+    """Keeps all metrics, or without value alignment only the others."""
     if config.value_alignment.weight == "off":
         return lambda name: "alignment" not in name
     return everything
 
 
 def peak_bytes(executables: Sequence[jax.stages.Compiled]) -> int:
-    """Most memory so far of the accelerator; of a CPU, which does not tell, what is planned.
+    """Peak memory of the accelerator so far; on a CPU, `planned_bytes`.
 
-    The peak of the process would be that of compiling.
+    The peak of the process would include compiling.
     """
     stats = jax.devices()[0].memory_stats()
     return stats["peak_bytes_in_use"] if stats else planned_bytes(executables)
 
 
 def planned_bytes(executables: Sequence[jax.stages.Compiled]) -> int:
-    """What the largest of them occupies by XLA's plan: arguments, results and temporaries."""
+    """Memory of the largest executable by XLA's plan: arguments, results and temporaries."""
 
     def of(executable: jax.stages.Compiled) -> int:
         plan = executable.memory_analysis()
@@ -195,17 +194,17 @@ def planned_bytes(executables: Sequence[jax.stages.Compiled]) -> int:
 
 
 def peak_process_bytes() -> int:
-    """Most memory of the machine that this process has had."""
+    """Peak memory of this process on the host."""
     return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # KiB on Linux
 
 
 def percent_more(values: Sequence[float], others: Sequence[float]) -> list[float]:
-    """By how many percent each of `values` is more than its neighbour in `others`."""
+    """How much larger each of `values` is than its neighbour in `others`, in percent."""
     return [100 * (a / b - 1) for a, b in zip(values, others, strict=True)]
 
 
 def quartiles(values: Sequence[float]) -> list[float]:
-    """The first and the third; both the value itself where there is only one."""
+    """The first and the third quartile; both are the value itself if there is only one."""
     if len(values) == 1:
         return [values[0], values[0]]
     first, _, third = statistics.quantiles(values, n=4, method="inclusive")

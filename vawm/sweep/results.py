@@ -1,4 +1,4 @@
-"""What the runs of a sweep measured: rows, aggregates over seeds, tables."""
+"""The metrics of a sweep's runs: rows, aggregates over seeds, tables."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from vawm.sweep.runs import Run, Sweep
 Rows = list[dict[str, Any]]
 
 RETURN = {"return": "episode/return"}
-"""Column -> metric, of what every sweep is about."""
+"""Column -> metric, for every sweep."""
 
 
 class Summary(NamedTuple):
-    """One variant in one task, over the seeds whose runs are finished, one entry for each.
+    """One variant in one task; lists have one entry per seed with a finished run.
 
     Attributes:
-      task, variant: which.
-      seeds: those that count.
-      missing: seed -> why it does not count.
+      task, variant: their names.
+      seeds: seeds with a finished run.
+      missing: other seed -> why it is missing.
       last: the last return.
       best: the highest return.
       area: the area under the curve of returns per env step: the mean return.
       minutes: wall time of the run.
-      late: other column -> its mean over the last tenth of the run, of each run that has it.
+      late: other column -> means over the last tenth of the runs that have it.
     """
 
     task: str
@@ -47,9 +47,9 @@ class Summary(NamedTuple):
 
 
 def read(sweep: Sweep, columns: Mapping[str, str] = RETURN) -> Rows:
-    """A row per line of metrics that has at least one of `columns`; the others are None.
+    """A row per line of metrics with at least one of `columns`; missing ones are None.
 
-    Of a run that went further than the sweep is long, the lines up to that length.
+    Stops at the sweep's length if a run is longer.
     """
     rows = []
     for run in runs.all_runs(sweep):
@@ -70,30 +70,30 @@ def read(sweep: Sweep, columns: Mapping[str, str] = RETURN) -> Rows:
 
 
 def read_some(sweep: Sweep, columns: Mapping[str, str] = RETURN) -> Rows:
-    """`read`, for results that are to be written in the place of others.
+    """`read`, but refuses to replace earlier results by empty ones.
 
     Raises:
-      RunError: nothing was measured yet.
+      RunError: there are no metrics yet.
     """
     if rows := read(sweep, columns):
         return rows
-    raise RunError(f"no run in {sweep.folder} has measured anything yet; nothing is written")
+    raise RunError(f"no run in {sweep.folder} has any metrics yet; no results were written")
 
 
 def rounded(column: str, value: float | None) -> float | None:
-    """Returns to a tenth, all else to 5 digits."""
+    """Rounds returns to one decimal, all else to 5 digits."""
     if value is None:
         return None
     return round(value, 1) if column == "return" else float(f"{value:.5g}")
 
 
 def of_run(rows: Rows, run: Run, column: str = "return") -> Rows:
-    """The rows of one run in which `column` was measured."""
+    """The rows of one run that have `column`."""
     return [row for row in rows if row.items() >= vars(run).items() and row[column] is not None]
 
 
 def area(rows: Rows) -> float:
-    """Area under the returns by the trapezoidal rule, per env step; needs one row at least."""
+    """Area under the returns per env step, by the trapezoidal rule; needs at least one row."""
     width = rows[-1]["env_steps"] - rows[0]["env_steps"]
     if not width:
         return rows[0]["return"]
@@ -105,13 +105,13 @@ def area(rows: Rows) -> float:
 
 
 def late_mean(rows: Rows, column: str) -> float:
-    """Mean of a column over the last tenth of a run's env steps; needs one row at least."""
+    """Mean of a column over the last tenth of a run's env steps; needs at least one row."""
     end = rows[-1]["env_steps"]
     return statistics.fmean(row[column] for row in rows if end - row["env_steps"] < end / 10)
 
 
 def missing(sweep: Sweep, rows: Rows, run: Run) -> str | None:
-    """Why a run does not count; None where it does."""
+    """Why a run is missing from the table; None if it is not."""
     own, length = of_run(rows, run), runs.env_steps(sweep, run)
     if not own or length is None:
         return "has no returns"
@@ -121,7 +121,7 @@ def missing(sweep: Sweep, rows: Rows, run: Run) -> str | None:
 
 
 def summarise(sweep: Sweep, rows: Rows, columns: Mapping[str, str] = RETURN) -> list[Summary]:
-    """A summary for each task and variant; seeds that are missing are named in it."""
+    """A summary for each task and variant, with the missing seeds."""
     summaries = []
     for task in sweep.tasks:
         for variant in sweep.variants:
@@ -153,7 +153,7 @@ def summarise(sweep: Sweep, rows: Rows, columns: Mapping[str, str] = RETURN) -> 
 
 
 def with_error(values: Sequence[float]) -> str:
-    """Mean and its standard error, which a single value has not."""
+    """Mean and its standard error; only the mean for a single value."""
     if not values:
         return "-"
     mean, error = mean_and_error(np.asarray(values))
@@ -162,12 +162,12 @@ def with_error(values: Sequence[float]) -> str:
 
 
 def markdown(summaries: Sequence[Summary], *, factor: str, command: str, notes: str) -> str:
-    """A table of means over seeds, the seeds that are missing in it, and what made it.
+    """A table of means over seeds, with the missing seeds and the command that made it.
 
     Args:
       summaries: at least one.
-      factor: what differs between variants: a heading.
-      command: how to make it again.
+      factor: what differs between variants, as a column heading.
+      command: that makes the table again.
       notes: a paragraph before the table.
     """
     names = [name.replace("_", " ") for name in summaries[0].late]
@@ -195,5 +195,5 @@ def line(cells: Sequence[str]) -> str:
 
 
 def headed(rows: Rows, factor: str) -> Rows:
-    """The rows of `read` with `factor` for "variant"."""
+    """The rows of `read`, with "variant" renamed to `factor`."""
     return [{{"variant": factor}.get(name, name): row[name] for name in row} for row in rows]
