@@ -1,4 +1,4 @@
-"""Analyses what value alignment does in trained runs; writes PNG, MP4, CSV and JSON.
+"""Analyses what value alignment does in trained runs; writes PNG, MP4, GIF, CSV and JSON.
 
     python experiments/analyse.py --logdirs runs/aligned runs/plain
     python experiments/analyse.py --logdirs runs/aligned --what values --episodes 20 --depth 15
@@ -7,6 +7,7 @@
     trajectories   imagination against the truth, Figs 3 and 7
     saliency       what decoder and value depend on, Figs 3 and 13
     values         value errors by depth of imagination, and actual returns
+    film           truth, imagination and value side by side, as a GIF; of runs from pixels
     curves         losses and the weight of value alignment in training, Figs 8, 9 and 12
 
 Plays whole episodes of every run in its own environments; everything but `curves` uses these.
@@ -30,6 +31,7 @@ from vawm.analysis import (
     curves,
     episodes,
     figures,
+    film,
     inference,
     movies,
     saliency,
@@ -48,6 +50,7 @@ from vawm.runs import run_folder
 from vawm.types import is_image
 
 FRAMES_PER_SECOND = 5  # slow enough to compare
+FILM_FRAMES_PER_SECOND = 10
 
 
 @dataclass(frozen=True)
@@ -56,7 +59,7 @@ class Options:
 
     logdirs: tuple[pathlib.Path, ...]
     """folders of runs"""
-    what: Literal["all", "trajectories", "saliency", "values", "curves"] = "all"
+    what: Literal["all", "trajectories", "saliency", "film", "values", "curves"] = "all"
     output: pathlib.Path = pathlib.Path("analysis")
     """folder of the results; existing files are overwritten"""
     episodes: int = 5
@@ -146,9 +149,14 @@ def check(options: Options, name: str, policy: Policy, player: Policy | None) ->
     if player is not None:
         episodes.check_can_watch(name, policy.spec, player.spec)
     inference.check(policy.config, context=options.context, depth=options.depth)
-    has_images = any(map(is_image, jax.tree.leaves(policy.spec.obs)))
-    if options.wants("trajectories") and has_images:
+    if options.wants("trajectories") and has_images(policy):
         movies.check()
+    if options.what == "film" and not has_images(policy):
+        raise InvalidInput("what", "film", f"{name} observes no images; use 'trajectories'")
+
+
+def has_images(policy: Policy) -> bool:
+    return any(map(is_image, jax.tree.leaves(policy.spec.obs)))
 
 
 def show_curves(options: Options, runs: dict[str, curves.Run]) -> None:
@@ -169,8 +177,8 @@ def show_trajectories(options: Options, played: Sequence[Played]) -> None:
             figures.strip(
                 name, shown, options.output / f"trajectories_{name}.png", every=options.every
             )
-            film = options.output / f"trajectories_{name}.mp4"
-            movies.write_mp4(trajectories.film(shown), film, per_second=FRAMES_PER_SECOND)
+            path = options.output / f"trajectories_{name}.mp4"
+            movies.write_mp4(trajectories.film(shown), path, per_second=FRAMES_PER_SECOND)
         if "vector" in kinds:
             figures.coordinates(name, shown, options.output / f"coordinates_{name}.png")
     tables.write_csv(rows, options.output / "trajectories.csv")
@@ -199,6 +207,21 @@ def show_saliency(options: Options, played: Sequence[Played]) -> None:
     if with_vectors:
         figures.saliency_vectors(with_vectors, options.output / "saliency_vectors.png")
     tables.write_csv(rows, options.output / "saliency.csv")
+
+
+def show_film(options: Options, played: Sequence[Played]) -> None:
+    for name, policy, record in played:
+        if has_images(policy):
+            made = film.make(
+                policy,
+                record,
+                context=options.context,
+                depth=options.depth,
+                seed=options.seed,
+                unit=options.unit,
+            )
+            path = options.output / f"film_{name}.gif"
+            movies.write_gif(film.frames(made), path, per_second=FILM_FRAMES_PER_SECOND)
 
 
 def show_values(options: Options, played: Sequence[Played]) -> None:
@@ -295,6 +318,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         for what, show in {
             "trajectories": show_trajectories,
             "saliency": show_saliency,
+            "film": show_film,
             "values": show_values,
         }.items():
             if options.wants(what):

@@ -1,5 +1,6 @@
-"""A whole run on real physics: trained, resumed, evaluated, and used as the README says."""
+"""A whole run on real physics: trained, resumed, evaluated, used as README and guide say."""
 
+import dataclasses
 import pathlib
 import re
 
@@ -10,6 +11,7 @@ import runs
 import tiny
 from gymnasium.envs.classic_control import CartPoleEnv
 
+import vawm
 from vawm import envs, evaluate, presets
 from vawm.config import GymnasiumConfig
 from vawm.runs import checkpoint, runner
@@ -17,8 +19,12 @@ from vawm.runs import checkpoint, runner
 CONFIG = tiny.config(
     task="pendulum_swingup", action_repeat=20, env_steps=3000, log_every=320, save_every=960
 )  # 160 env steps per chunk; an episode ends at 2000
-README = pathlib.Path(__file__).parents[1] / "README.md"
-SNIPPETS = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
+ROOT = pathlib.Path(__file__).parents[1]
+README, GUIDE = ROOT / "README.md", ROOT / "docs" / "guides" / "proprio.md"
+
+
+def snippets(page):
+    return re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)
 
 
 @pytest.fixture(scope="module")
@@ -55,9 +61,9 @@ def test_both_simulations_report_whole_episodes(logdir, capsys):
         assert 0 <= float(score.split()[1]) <= 1000
 
 
-def snippet(name):
-    """The README's one block of Python that mentions `name`."""
-    (found,) = [text for text in SNIPPETS if name in text]
+def snippet(name, page=README):
+    """The one block of Python of a page that mentions `name`."""
+    (found,) = [text for text in snippets(page) if name in text]
     return found
 
 
@@ -70,19 +76,19 @@ def test_the_readme_loads_a_checkpoint_and_acts(logdir, monkeypatch):
     assert names["timestep"].obs.shape == (4, 3)
 
 
-def test_the_readme_makes_environments():
+def test_the_guide_makes_environments():
     names = {}
-    exec(snippet("gymnasium.make_vec"), names)
+    exec(snippet("gymnasium.make_vec", GUIDE), names)
     assert names["env"].spec.num_envs == 64
     assert names["gym_env"].num_envs == 64
 
 
-def test_the_readme_stacks_seeds(monkeypatch):
+def test_the_guide_stacks_seeds(monkeypatch):
     monkeypatch.setattr(presets, "QUICK", tiny.CONFIG)
     monkeypatch.setattr(envs, "make", lambda *_, **__: tiny.env())
     names = {}
     with jax.debug_key_reuse(False):  # it takes a slice of a batch of keys for all of them
-        exec(snippet("over_seeds"), names)
+        exec(snippet("over_seeds", GUIDE), names)
     assert names["metrics"]["env_steps"].tolist() == [8] * 8
 
 
@@ -90,9 +96,11 @@ def test_the_readme_trains_in_an_environment_of_ones_own(tmp_path, monkeypatch):
     settings = {"suite": "gymnasium", "env": GymnasiumConfig(workers=1)}
     monkeypatch.setattr(presets, "GYMNASIUM_QUICK", tiny.config(**settings))
     monkeypatch.chdir(tmp_path)
-    exec(snippet("from_gymnasium"), {"MyEnv": CartPoleEnv})
+    names = {"MyEnv": CartPoleEnv, "dataclasses": dataclasses, "presets": presets}
+    exec(snippet("from_gymnasium"), names | {"runner": runner, "vawm": vawm})
     assert runs.lines(tmp_path / "runs" / "my_env")[-1]["env_steps"] >= 96
 
 
 def test_every_snippet_of_the_readme_is_run_here():
-    assert len(SNIPPETS) == 5
+    """The losses of the README in `test_docs.py`."""
+    assert len(snippets(README)) == 3

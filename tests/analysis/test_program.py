@@ -16,6 +16,7 @@ import tiny
 import tiny_pixels
 import tiny_vagram
 from analysis_records import make_episodes, make_policy, save_run
+from PIL import Image
 
 from vawm.analysis import figures, tables
 from vawm.cli import command_line
@@ -105,6 +106,7 @@ def drawn(monkeypatch):
         (["--logdirs", "RUN", "--depth", "0"], "depth=0: "),
         (["--logdirs", "RUN", "--context", "1"], "context=1: "),
         (["--logdirs", "RUN", "--player", "."], "logdir='.': "),
+        (["--logdirs", "RUN", "--what", "film"], "what='film': "),
         (
             ["--logdirs", "RUN", "STRANGER", "--player", "RUN"],
             "player='obs ShapeDtypeStruct(shape=(2,), dtype=float32)': stranger was trained "
@@ -290,6 +292,16 @@ def test_imagined_pixels_are_a_strip_and_a_film(from_pixels, drawn, tmp_path):
     with (tmp_path / "trajectories.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert {row["kind"] for row in rows} == {"image", "vector"}
+
+
+def test_truth_imagination_and_value_are_a_gif(from_pixels, tmp_path):
+    record, _ = from_pixels("--what", "film", "--context", "2", "--depth", "2")
+    with Image.open(tmp_path / "film_pixels.gif") as film:
+        assert film.n_frames == 4
+        first = np.asarray(film.convert("RGB"), float)
+    truth = np.asarray(record.trajectory.obs["picture"])[0, 1]
+    panel = first[28 : 28 + 288, :288]
+    np.testing.assert_allclose(panel.mean(), truth.mean(), atol=8)
 
 
 def test_saliency_is_drawn_over_pixels(from_pixels, drawn, tmp_path):

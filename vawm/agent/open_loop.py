@@ -19,18 +19,15 @@ class OpenLoop(NamedTuple):
     same_episode: Array  # [B, T] bool, whether no reset lies between the context and here
 
 
-def make_open_loop(agent: Agent, *, context: int) -> Callable[..., OpenLoop]:
-    """Build `open_loop(params, state, key, batch) -> OpenLoop`.
+def make_states(agent: Agent, *, context: int) -> Callable[..., tuple[Latent, Latent]]:
+    """Build `states(params, state, key, batch) -> (inferred, imagined)`.
 
-    The first `context` of the T steps are observed, and decoded from their posterior. The
-    others are imagined with the batch's own actions and never looked at. No gradient.
+    The first `context` of the T steps are observed, `[B, context, ...]`. The others are
+    imagined with the batch's own actions; their observations are never read. No gradient.
     """
     world_model = agent.world_model
 
-    def decode(params: Params, state: PyTree, latent: Latent) -> PyTree:
-        return world_model.predict(params.world_model, state, latent).obs
-
-    def open_loop(params: Params, state: PyTree, key: Key, batch: Batch) -> OpenLoop:
+    def states(params: Params, state: PyTree, key: Key, batch: Batch) -> tuple[Latent, Latent]:
         model = params.world_model
         key_follow, key_imagine = jax.random.split(key)
         steps = batch.trajectory
@@ -49,8 +46,21 @@ def make_open_loop(agent: Agent, *, context: int) -> Callable[..., OpenLoop]:
         imagined = jax.tree.map(
             lambda a, b: jnp.concatenate([a[:, None], b.swapaxes(0, 1)], axis=1), first, latent
         )
-        parts = decode(params, state, inferred), decode(params, state, imagined)
-        resets = jnp.cumsum(steps.is_first[:, 1:].astype(jnp.int32), axis=1)
+        return inferred, imagined
+
+    return states
+
+
+def make_open_loop(agent: Agent, *, context: int) -> Callable[..., OpenLoop]:
+    """Build `open_loop(params, state, key, batch) -> OpenLoop`: the states, decoded."""
+    states = make_states(agent, context=context)
+
+    def decode(params: Params, state: PyTree, latent: Latent) -> PyTree:
+        return agent.world_model.predict(params.world_model, state, latent).obs
+
+    def open_loop(params: Params, state: PyTree, key: Key, batch: Batch) -> OpenLoop:
+        parts = [decode(params, state, part) for part in states(params, state, key, batch)]
+        resets = jnp.cumsum(batch.trajectory.is_first[:, 1:].astype(jnp.int32), axis=1)
         return OpenLoop(
             predicted=jax.tree.map(lambda a, b: jnp.concatenate([a, b], axis=1), *parts),
             same_episode=resets == resets[:, context - 1, None],

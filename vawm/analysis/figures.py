@@ -250,8 +250,11 @@ def saliency_vectors(looks: Mapping[str, Look], path: pathlib.Path) -> None:
 def curves(all_curves: Curves, path: pathlib.Path) -> None:
     """Draws a panel per metric and a colour per group; bands from lowest to highest seed."""
     shown = [metric for metric in METRICS if any(metric in own for own in all_curves.values())]
-    with panels(path, 1, max(1, len(shown)), size=(3.6, 3)) as axes:
-        for ax, metric in zip(axes[0], shown, strict=False):
+    columns = min(3, max(1, len(shown)))
+    with panels(path, max(1, -(-len(shown) // columns)), columns, size=(3.6, 3)) as axes:
+        for ax in axes.ravel()[len(shown) :]:
+            ax.set_visible(False)
+        for ax, metric in zip(axes.ravel(), shown, strict=False):
             for color, (name, own) in enumerate(all_curves.items()):
                 if metric in own:
                     line = own[metric]

@@ -1,4 +1,4 @@
-"""Writes frames to MP4, with imageio and its ffmpeg."""
+"""Writes frames to MP4, with imageio and its ffmpeg, and to GIF."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import pathlib
 import warnings
 
 import numpy as np
+from PIL import Image
 
 from vawm.runs.reports.video import FRAMES_PER_SECOND
 from vawm.runs.runner import RunError
@@ -58,3 +59,23 @@ def write_mp4(
             macro_block_size=1,
             ffmpeg_log_level="error",
         )
+
+
+def write_gif(
+    frames: np.ndarray, path: pathlib.Path, *, per_second: int, colors: int = 256
+) -> None:
+    """An animated GIF of `[T, H, W, 3]` uint8 frames that repeats; needs no package.
+
+    All frames share one palette, made of every sixth, and are not dithered: both keep the file
+    small. An octree keeps colours that few pixels have.
+
+    Raises:
+      OSError: the file could not be written.
+    """
+    together = Image.fromarray(np.concatenate(list(frames[::6])))
+    palette = together.quantize(colors, method=Image.Quantize.FASTOCTREE)
+    first, *rest = (
+        Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE)
+        for frame in frames
+    )
+    first.save(path, save_all=True, append_images=rest, duration=1000 // per_second, loop=0)

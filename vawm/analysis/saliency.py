@@ -70,11 +70,8 @@ def make_saliency(
         mean of (J v)^2, with J = d o / d z. Unbiased, with a relative standard error of at
         most sqrt(2 / probes) per entry. No Jacobian is built.
     """
-    world_model, critic = agent.world_model, agent.critic
-
-    def value(params: Params, latent: Latent) -> Array:
-        mean = critic.code.mean(critic.logits(params.critic, latent))
-        return transforms.symlog(mean) if unit == "symlog" else mean
+    world_model = agent.world_model
+    value = make_value(agent, unit=unit)
 
     def saliency(params: Params, state: PyTree, key: Key, batch: Batch) -> Saliency:
         key_follow, key_probe = jax.random.split(key)
@@ -96,18 +93,13 @@ def make_saliency(
             return value(params, latent).sum(), latent
 
         last = jax.tree.map(lambda x: x[:, -1], batch.trajectory.obs)
-        observed, (deter, stoch) = gradient(value_after, last)
-
-        def decode(stoch: Array) -> PyTree:
-            return world_model.predict(model, state, Latent(deter, on_simplex(stoch))).obs
+        observed, latent = gradient(value_after, last)
 
         def probe(total: PyTree, key: Key):
-            sign = jax.random.rademacher(key, stoch.shape, stoch.dtype)
+            sign = jax.random.rademacher(key, latent.stoch.shape, latent.stoch.dtype)
             return jax.tree.map(lambda t, x: t + jnp.square(x), total, push(sign)), None
 
-        # No network mixes rows, so the gradient of the sum contains that of each row.
-        slope = jax.grad(lambda z: value(params, Latent(deter, on_simplex(z))).sum())(stoch)
-        decoded, push = forward(decode, stoch)
+        decoded, push, slope = around(agent, value, params, state, latent)
         zero = jax.tree.map(jnp.zeros_like, decoded)
         squares, _ = jax.lax.scan(probe, zero, jax.random.split(key_probe, probes))
         return Saliency(
@@ -115,10 +107,68 @@ def make_saliency(
             sensitivity=norms(jax.tree.map(lambda x: jnp.sqrt(x / probes), squares), last),
             value=norms(push(slope), last),
             observed=norms(observed, last),
-            states=value(params, Latent(deter, stoch)),
+            states=value(params, latent),
         )
 
     return saliency
+
+
+def make_value(agent: Agent, *, unit: Unit) -> Callable[[Params, Latent], Array]:
+    """Build `value(params, latent) -> V` in `unit`, of any leading dims."""
+    critic = agent.critic
+
+    def value(params: Params, latent: Latent) -> Array:
+        mean = critic.code.mean(critic.logits(params.critic, latent))
+        return transforms.symlog(mean) if unit == "symlog" else mean
+
+    return value
+
+
+def around(
+    agent: Agent,
+    value: Callable[[Params, Latent], Array],
+    params: Params,
+    state: PyTree,
+    latent: Latent,
+) -> tuple[PyTree, Callable[[Array], PyTree], Array]:
+    """Decoder and value near F states, along the simplex of z.
+
+    Returns:
+      The decoded observation, `push(v) = J v` with J = d o / d z, and dV/dz `[F, S, K]`.
+    """
+    deter, stoch = latent
+
+    def decode(stoch: Array) -> PyTree:
+        on_it = Latent(deter, on_simplex(stoch))
+        return agent.world_model.predict(params.world_model, state, on_it).obs
+
+    # Rows do not meet in any network, so the gradient of the sum is that of each.
+    slope = jax.grad(lambda z: value(params, Latent(deter, on_simplex(z))).sum())(stoch)
+    return *forward(decode, stoch), slope
+
+
+def value_map(
+    agent: Agent, *, unit: Unit = "symlog"
+) -> Callable[[Params, PyTree, Latent, PyTree], tuple[PyTree, PyTree]]:
+    """Build `maps(params, state, latent, like) -> (decoded, value)` of any F states.
+
+    Args:
+      agent: the agent.
+      unit: of V.
+
+    Returns:
+      A function of states, imagined or inferred, and of F observations like theirs, which only
+      say what is an image. It returns `Saliency.decoded` and `Saliency.value` of the states.
+    """
+    value = make_value(agent, unit=unit)
+
+    def maps(
+        params: Params, state: PyTree, latent: Latent, like: PyTree
+    ) -> tuple[PyTree, PyTree]:
+        decoded, push, slope = around(agent, value, params, state, latent)
+        return decoded, norms(push(slope), like)
+
+    return maps
 
 
 def forward(

@@ -18,7 +18,7 @@ from vawm.analysis.episodes import Episodes, windows
 from vawm.losses.transforms import symlog
 from vawm.policy import Policy
 from vawm.runs.reports import video
-from vawm.types import PyTree, is_image
+from vawm.types import Batch, PyTree, is_image
 
 
 class Trajectories(NamedTuple):
@@ -59,10 +59,8 @@ def imagine(
     """
     inference.check(policy.config, context=context, depth=depth)
     agent = make_agent(policy.config, policy.spec)
+    start, batch = draw(episodes, length=context + depth + 1, seed=seed, at_most=at_most)
     length = np.asarray(episodes.length)[:at_most]
-    room = np.maximum(length - (context + depth + 1), 0)
-    start = np.random.default_rng(seed).integers(room + 1)
-    batch = windows(episodes, np.arange(len(start)), start, length=context + depth + 1)
     open_loop = jax.jit(make_open_loop(agent, context=context))
     predicted = open_loop(policy.params, policy.state, jax.random.key(seed), batch).predicted
     time = start[:, None] + np.arange(1, context + depth + 1)
@@ -73,6 +71,15 @@ def imagine(
         inside=time < length[:, None],
         context=context,
     )
+
+
+def draw(
+    episodes: Episodes, *, length: int, seed: int, at_most: int
+) -> tuple[np.ndarray, Batch]:
+    """Where a window of `length` steps begins in each episode, and these windows."""
+    room = np.maximum(np.asarray(episodes.length)[:at_most] - length, 0)
+    start = np.random.default_rng(seed).integers(room + 1)
+    return start, windows(episodes, np.arange(len(start)), start, length=length)
 
 
 def errors(trajectories: Trajectories) -> dict[str, np.ndarray]:
