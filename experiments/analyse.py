@@ -7,7 +7,7 @@
     trajectories   imagination against the truth, Figs 3 and 7
     saliency       what decoder and value depend on, Figs 3 and 13
     values         value errors by depth of imagination, and actual returns
-    film           truth, imagination and value side by side, as a GIF; of runs from pixels
+    film           truth, imagination and value side by side, as a GIF; for runs from pixels
     curves         losses and the weight of value alignment in training, Figs 8, 9 and 12
 
 Plays whole episodes of every run in its own environments; everything but `curves` uses these.

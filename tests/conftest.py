@@ -1,4 +1,4 @@
-"""Strictness and the compilation cache for every test."""
+"""Strict settings of JAX and the compilation cache for every test."""
 
 import os
 
@@ -16,13 +16,13 @@ hurry.hurry()
 cache.enable()
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_debug_key_reuse", True)
-# The same examples in every run; the first of each test compiles, whatever the time.
+# The same examples in every run, and no deadline: the first example of a test compiles.
 hypothesis.settings.register_profile("vawm", derandomize=True, deadline=None, max_examples=50)
 hypothesis.settings.load_profile("vawm")
 
 
 def pytest_configure(config):
-    """Where what rendering needs has been installed, no test is skipped for want of it."""
+    """With `VAWM_TESTS_RENDER` set, fails if a backend cannot render instead of skipping."""
     if os.environ.get("VAWM_TESTS_RENDER") and not hasattr(config, "workerinput"):
         for backend in rendering.BACKENDS:
             if fault := rendering.fault(backend):
@@ -31,5 +31,5 @@ def pytest_configure(config):
 
 @pytest.fixture(autouse=True)
 def fresh_trace_counter():
-    """chex counts traces by function name; a factory's closures share theirs."""
+    """Resets chex's counts of traces: closures from one factory share a name, and a count."""
     chex.clear_trace_counter()

@@ -1,4 +1,4 @@
-"""Truth, imagination and value side by side: what is in the panels, and as a GIF."""
+"""Films of truth, imagination and value: the content of the panels, and the GIF."""
 
 import dataclasses
 
@@ -10,9 +10,9 @@ import tiny
 import tiny_pixels
 from analysis_records import make_episodes, make_policy
 from PIL import Image
+from refusals import refused
 
 from vawm.analysis import figures, film, movies, trajectories
-from vawm.errors import InvalidInput
 from vawm.runs.reports import video
 from vawm.types import EnvSpec
 
@@ -89,5 +89,5 @@ def test_a_gif_has_all_frames_and_repeats(made, tmp_path):
 
 
 def test_what_cannot_be_imagined_is_refused(policy, record):
-    with pytest.raises(InvalidInput, match="depth=0"):
+    with refused("depth", 0):
         film.make(policy, record, context=3, depth=0, seed=0)

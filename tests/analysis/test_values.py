@@ -284,8 +284,7 @@ def test_every_state_with_a_context_is_inferred(played):
 
 @pytest.fixture(scope="module")
 def explained(played):
-    """What a world model with states of its own makes of the first episode, as the report
-    had it."""
+    """What a world model that has states infers from the first episode, as in the report."""
     policy, recorded, _ = played
     agent = values.make_agent(policy.config, policy.spec)
     if agent.world_model.starts is None:

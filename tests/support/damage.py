@@ -23,7 +23,7 @@ def delete(file):
 
 
 def harms(rng):
-    """Functions that damage a file of all `files`."""
+    """Functions `(file, files)` that damage `file`, one of all `files`."""
 
     def at(content):
         return rng.randrange(len(content))
@@ -65,9 +65,9 @@ def harms(rng):
 
 
 def corrupt(logdir, expected, count, rng):
-    """Damages the only checkpoint, which holds `expected`, `count` times, one way each time.
+    """Damages the only checkpoint, which holds `expected`, `count` times, one file each time.
 
-    Returns how often that was refused: every time that a file has changed.
+    Returns how often it was refused, which must be every time that a file has changed.
     """
     files = files_of(logdir)
     contents = {file: file.read_bytes() for file in files}

@@ -26,7 +26,7 @@ class Transitions(NamedTuple):
 
 
 def load(name: str, seed: int = 0):
-    """dm_control's environment, without the deprecation warning that goes to a file."""
+    """dm_control's environment, without the deprecation warning that it writes to a file."""
     mujoco.set_mju_user_warning(lambda message: None)
     domain, task = split(name)
     return suite.load(domain, task, task_kwargs={"random": seed})

@@ -1,6 +1,6 @@
-"""Random configs: tiny ones of every agent, a few of whose choices are anything at all.
+"""Random configs: tiny ones of every agent, with a few choices replaced by arbitrary values.
 
-Each has to be refused by the name of a choice, or to train.
+Each config has to be refused by the name of a choice, or to train.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from vawm.learning import train
 from vawm.runs import diagnosis, runner, suites, validate
 from vawm.types import EnvSpec
 
-STEPS = 50  # of a config that does not come to its second update before
+STEPS = 50  # at most, for a config that has not reached its second update
 
 PIXELS = {
     suite: tiny_pixels.config(
@@ -38,7 +38,7 @@ PIXELS = {
     for suite, record in suites.SUITES.items()
     if issubclass(record.choices, HostEnvConfig)
 }
-"""From images, in environments of every suite on the host."""
+"""Configs that learn from images, one for every suite on the host."""
 BASES = {"dreamerv3": tiny.CONFIG, "storm": tiny_storm.CONFIG, "vagram": tiny_vagram.CONFIG}
 
 USUAL_INTS = st.integers(1, 9) | st.sampled_from([0, 16, 24, 32, 48, 64, 200])
@@ -49,7 +49,7 @@ JUNK = st.none() | st.booleans() | st.text(max_size=3) | st.just([]) | FLOATS | 
 
 
 def value_of(kind: typing.Any) -> st.SearchStrategy:
-    """Mostly what the type allows, sometimes junk."""
+    """Values for a field of type `kind`: mostly what the type allows, sometimes junk."""
     if typing.get_origin(kind) is typing.Literal:
         usual = st.sampled_from(typing.get_args(kind))
     elif kind is bool:
@@ -64,7 +64,7 @@ def value_of(kind: typing.Any) -> st.SearchStrategy:
 
 
 class Nothing:
-    """In the place of `tiny_pixels.pool()`: what is known before any process is started."""
+    """Replaces `tiny_pixels.pool()`: has only what is known before a process starts."""
 
     restarts = 0
 
@@ -100,7 +100,7 @@ NAMES |= {"world_model", "optimizer", "env"}
 
 
 def refusal(config: Config, folder: pathlib.Path) -> str:
-    """Why `config` is refused, in one line that begins with the name of a choice; or ""."""
+    """Why `config` is refused: one line that begins with the name of a choice. Or ""."""
     try:
         runner.check(config, folder, resume=False, known_task=False)
         on_device = suites.host_choices(config) is None
@@ -113,7 +113,7 @@ def refusal(config: Config, folder: pathlib.Path) -> str:
 
 
 def trace(config: Config) -> None:
-    """The whole training step of a config that is not refused: states lead to their like."""
+    """Traces the whole training step of a valid config; it must keep shapes and dtypes."""
     init, step = programs(config)
     before = jax.eval_shape(init, jax.random.key(0))
     after, metrics = jax.eval_shape(step, before)
@@ -122,10 +122,10 @@ def trace(config: Config) -> None:
 
 
 def run(config: Config) -> str:
-    """As `trace`, but compiled and done, until two updates, and what came of it.
+    """Compiles and runs the step that `trace` traces, until two updates. Returns the outcome.
 
-    "learned": all that is learned stays finite. "diagnosed": it does not, and a run would say
-    so. "collected": there was no second update in as many steps.
+    "learned": everything that is learned stays finite. "diagnosed": it does not, and a run
+    would stop and say so. "collected": no second update within `STEPS` steps.
     """
     init, step = programs(config)
     step = jax.jit(step)
@@ -142,7 +142,7 @@ def run(config: Config) -> str:
 
 
 def programs(config: Config) -> tuple[Callable, Callable]:
-    """The functions that begin and continue a run of `config`."""
+    """The functions that start and continue a run of `config`."""
     env = tiny.env()
     agent = make_agent(config, env.spec)
     return functools.partial(train.init, env, agent, config), train.make_train_step(

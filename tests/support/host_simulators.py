@@ -50,7 +50,7 @@ class Walk:
 
 
 class Troubled(Walk):
-    """A walk with trouble at a given step of every episode, or of those of some seeds.
+    """A walk with trouble at a given step of every episode, or of the episodes of some seeds.
 
     `trouble` is the name of a method below, or a dict of names by seed.
     """
@@ -105,7 +105,7 @@ class BadEnd(Troubled):
 
 
 class Echo:
-    """Returns the action that it got as its observation."""
+    """Its observation is the last action."""
 
     obs = vector(3)
     action_size = 3
@@ -126,7 +126,7 @@ class Echo:
 
 
 class Chance(Walk):
-    """A walk whose episodes of odd seeds cannot be replayed."""
+    """A walk that cannot replay its episodes of odd seeds."""
 
     def step(self, action):
         if self.seed % 2:
@@ -142,7 +142,7 @@ class Chance(Walk):
 
 
 class Changed(Walk):
-    """A walk with the trouble that a file names in its second step, if there is a file."""
+    """A walk with trouble in its second step, if a file exists; the file names the trouble."""
 
     def __init__(self, path):
         super().__init__()

@@ -1,4 +1,4 @@
-"""Observations and rewards whose squares float32 cannot hold, for every agent."""
+"""Observations and rewards so large that their squares overflow float32, for every agent."""
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ UPDATES = 3
 
 
 def huge(agent, count, length):
-    """Mostly usual numbers, but for some of 1e30 in both directions."""
+    """A batch of mostly usual numbers, and some around 1e30 and -1e30."""
     rng = np.random.default_rng(count)
 
     def numbers(*shape):
@@ -40,7 +40,7 @@ def huge(agent, count, length):
 
 
 def learn_from_them(config):
-    """Some updates, and an action: all of it has to stay finite."""
+    """Makes `UPDATES` updates and an action after each; all results must be finite."""
     agent = make_agent(config, tiny.env().spec)
     update = make_update(agent, config)
 
@@ -54,7 +54,7 @@ def learn_from_them(config):
         return learner, metrics, action
 
     learner = init_learner(agent, config, jax.random.key(0))
-    learner = learner._replace(params=noisy(learner.params))  # a critic of zeros hides much
+    learner = learner._replace(params=noisy(learner.params))  # zeros would hide errors
     batch, contexts = (shape and huge(agent, *shape) for shape in from_replay.shapes(config))
     for number in range(UPDATES):
         learner, metrics, action = learn_and_act(

@@ -1,6 +1,6 @@
-"""XLA compiles in less than half of the usual time; what comes out is slower, and as exact.
+"""Makes XLA compile in less than half of the usual time; the code is slower, and as exact.
 
-Most of the time of tests goes into compiling what is run once.
+Tests spend most of their time compiling functions that they run once.
 """
 
 import importlib.metadata
@@ -10,9 +10,9 @@ FLAGS = ["--xla_backend_optimization_level=0", "--xla_llvm_disable_expensive_pas
 if importlib.metadata.version("jaxlib").startswith("0.10."):  # an unknown flag is fatal
     FLAGS.append("--xla_cpu_use_fusion_emitters=false")
 USUAL = os.environ.get("XLA_FLAGS", "")
-"""What the caller has set."""
+"""The flags that the caller has set."""
 
 
 def hurry() -> None:
-    """For this process, which has not compiled yet, and for those that it starts."""
+    """Sets the flags for this process, before it compiles anything, and for its children."""
     os.environ["XLA_FLAGS"] = " ".join([USUAL, *FLAGS])

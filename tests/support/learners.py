@@ -1,4 +1,4 @@
-"""Learners to compute losses with, which no optimiser has touched."""
+"""Learners for computing losses, without a state of an optimiser."""
 
 import jax.numpy as jnp
 

@@ -1,4 +1,4 @@
-"""Layers in numpy and float64, and parameters that are not at their initial values."""
+"""Layers in numpy and float64, and parameters moved away from their initial values."""
 
 import jax
 import numpy as np
@@ -9,7 +9,7 @@ def params_of(module, *inputs):
 
 
 def noisy(params):
-    """Parameters with biases and norm scales that are not trivial."""
+    """Adds noise to parameters, so that no bias is 0 and no norm scale is 1."""
     leaves, tree = jax.tree.flatten(params)
     keys = jax.random.split(jax.random.key(1), len(leaves))
     return jax.tree.unflatten(
@@ -40,7 +40,7 @@ def float64(tree):
 
 
 def block_gru_twin(p, h, z, a, blocks):
-    """One step, block by block, with x copied to every block."""
+    """Computes one step, block by block, with x copied to every block."""
     a = a / np.maximum(1.0, np.abs(a))
     x = np.concatenate(
         [layer(p["from_deter"], h), layer(p["from_stoch"], z), layer(p["from_action"], a)], -1

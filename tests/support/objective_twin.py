@@ -25,7 +25,7 @@ BINS = np.asarray(scalar_agent.BINS, np.float64)
 
 
 def batch():
-    """T + 1 steps of two streams: in one an episode ends at step 2, in one it is cut at 1."""
+    """T + 1 steps of two streams: one has an episode end at step 2, one is cut at step 1."""
     rng, shape = np.random.default_rng(0), (B, T + 1)
     is_first, is_last, is_terminal = np.zeros((3, *shape), bool)
     is_last[0, 2] = is_terminal[0, 2] = is_first[0, 3] = True
@@ -43,7 +43,7 @@ def batch():
 
 
 def trajectory():
-    """That of the batch, for loops."""
+    """The trajectory of the batch as numpy arrays."""
     return jax.tree.map(np.asarray, batch().trajectory)
 
 
@@ -84,7 +84,7 @@ def actor_loss(state, advantage):
 
 
 def path(state):
-    """s_0 .. s_H, of which s_0 is `state`."""
+    """s_0 .. s_H, where s_0 is `state`."""
     states = [state]
     for _ in range(H):
         h, _ = states[-1]
@@ -93,7 +93,7 @@ def path(state):
 
 
 def imagined_returns(states):
-    """R_0 .. R_{H-1}: what arrives with s_1 .. s_H."""
+    """R_0 .. R_{H-1}, from the rewards that arrive with s_1 .. s_H."""
     arriving = states[1:]
     reward = [mean(REWARD * h) for h, _ in arriving]
     return slow_lambda_returns(

@@ -1,4 +1,4 @@
-"""Returns as the recursions that define them, in float64."""
+"""Returns computed by the recursions that define them, in float64."""
 
 import numpy as np
 
@@ -14,7 +14,7 @@ def slow_lambda_returns(reward, discount, value, lambda_):
 
 
 def slow_replay_returns(reward, is_last, is_terminal, bootstrap, discount, lambda_):
-    """One episode at a time and one step at a time, as the docstring says it."""
+    """Computes one episode and one step at a time, as the function's docstring defines it."""
     batch, length = reward.shape
     result = np.zeros((batch, length - 1))
     for b in range(batch):

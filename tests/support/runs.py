@@ -55,7 +55,7 @@ def events(logdir):
 
 
 def assert_same(actual, expected, config, env=None):
-    """Checks that two complete runs of `config` have the same state bit for bit, and lines."""
+    """Checks that two complete runs have the same state bit for bit, and the same lines."""
     with contextlib.closing(runner.prepare(config, env)) as trainer:
         shapes = trainer.shapes
     (state, manifest), (other, other_manifest) = (

@@ -5,8 +5,8 @@
     heads        observation h; reward and value: a bump over the bins around w h and around
                  w (h + z), with w the parameter; logit of the continuation 2 + h - 40 z
 
-A predicted latent has z~ = 1. In a state inferred, z = 1 means that nothing follows it.
-Keys are not used.
+A predicted latent has z~ = 1. In an inferred state, z = 1 means that the episode ends there.
+Random keys are not used.
 """
 
 import dataclasses
@@ -32,7 +32,7 @@ from vawm.types import (
 from vawm.world_model.packing import pack
 from vawm.world_model.protocol import WorldModel
 
-CONFIG = dataclasses.replace(  # no scale is 1, so that none can be forgotten unseen
+CONFIG = dataclasses.replace(  # no scale is 1, so that a forgotten one is noticed
     tiny.CONFIG,
     world_model=dataclasses.replace(
         tiny.CONFIG.world_model, classes=2, reconstruction_scale=0.7
@@ -65,7 +65,7 @@ def around(center):
 
 
 def inference(h, z):
-    """What a batch of states is taken for, `[B, T]`."""
+    """The `Inference` of states h and z, `[B, T]`."""
     logits = jnp.stack([h, jnp.zeros_like(h)], axis=-1)[..., None, :]
     return Inference(
         latent=latent(h, z),

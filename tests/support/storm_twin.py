@@ -1,8 +1,8 @@
 """STORM's official architecture in plain numpy float64, written from its formulas.
 
-Parameters are the trees of ours; everything else is loops and matrix products. What is random
-or has no gradient is given: the samples, and the numbers behind every stop-gradient, so that
-differences of `loss` are the gradients that the official code follows.
+The parameter trees are those of `vawm`; everything else is loops and matrix products. What is
+random or has no gradient is given: the samples, and the numbers behind every stop-gradient.
+Finite differences of the loss are therefore the gradients that the official code follows.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ import numpy as np
 
 
 class Given(NamedTuple):
-    """What a difference of the loss must not move: values at the parameters themselves."""
+    """Values that stay fixed in a difference of the loss: those at the unmoved parameters."""
 
     one_hot: np.ndarray  # [B, T, S, K] samples of the posterior
     prior_one_hot: np.ndarray  # [B, T - 1, S, K] of the prior
-    probs: np.ndarray  # whose straight-through gradient the samples have
+    probs: np.ndarray  # the samples have their straight-through gradient
     prior_probs: np.ndarray
     post_log: np.ndarray  # log-probabilities of z
     prior_log: np.ndarray
@@ -41,21 +41,21 @@ def layer_norm(p, x, epsilon):
 
 
 def mlp(p, x):
-    """Hidden layers without bias, LayerNorm, ReLU; then the outputs."""
+    """Hidden layers without bias, each with LayerNorm and ReLU; then the outputs."""
     for i in range(sum(name.startswith("hidden") for name in p)):
         x = np.maximum(layer_norm(p[f"norm_{i}"], linear(p[f"hidden_{i}"], x), 1e-5), 0)
     return linear(p["heads_0"], x) if "heads_0" in p else x
 
 
 def batch_norm(p, x, statistics=None):
-    """With the statistics of the batch, or with running ones."""
+    """Batch norm with the statistics of the batch, or with the running ones if given."""
     axes = tuple(range(x.ndim - 1))
     mean, var = (x.mean(axes), x.var(axes)) if statistics is None else statistics
     return (x - mean) / np.sqrt(var + 1e-5) * p["scale"] + p["bias"]
 
 
 def convolve(x, kernel):
-    """4 x 4, stride 2, one pixel of zeros around; `[N, H, W, in]`, `[4, 4, in, out]`."""
+    """4 x 4 kernel, stride 2, padded by one zero; `[N, H, W, in]`, `[4, 4, in, out]`."""
     x = np.pad(x, ((0, 0), (1, 1), (1, 1), (0, 0)))
     height, width = (x.shape[1] - 2) // 2, (x.shape[2] - 2) // 2
     y = np.zeros((x.shape[0], height, width, kernel.shape[-1]))
@@ -66,7 +66,7 @@ def convolve(x, kernel):
 
 
 def convolve_transposed(x, kernel):
-    """Every pixel is spread by the kernel, 2 pixels apart; the outermost row is cut off."""
+    """Adds the kernel times each pixel, 2 pixels apart; the outermost pixels are cut off."""
     count, height, width, _ = x.shape
     y = np.zeros((count, 2 * height + 2, 2 * width + 2, kernel.shape[-1]))
     for r in range(4):
@@ -76,7 +76,7 @@ def convolve_transposed(x, kernel):
 
 
 def attention(p, x, heads):
-    """One block: post-norm, no dropout."""
+    """One transformer block: post-norm, no dropout."""
     batch, length, width = x.shape
     query, key, value = np.split(linear(p["qkv"], x), 3, axis=-1)
     mixed = np.zeros_like(x)
@@ -111,7 +111,7 @@ def unimix_log(logits, share):
 
 
 def two_hot_cross_entropy(logits, number):
-    """To a number, linear between the two bins around its symlog."""
+    """Cross-entropy to a number coded as the two bins around its symlog."""
     y, n = np.sign(number) * np.log1p(abs(number)), logits.shape[-1]
     place = (y + 20) / 40 * (n - 1)
     below = int(np.floor(place))
@@ -124,11 +124,11 @@ def kl(p_log, q_log):
 
 
 class Forward(NamedTuple):
-    """What the networks say, and the parts of the loss."""
+    """The outputs of the networks, and the parts of the loss."""
 
     post_logits: np.ndarray  # [B, T, S, K] of the first T steps
-    prior_logits: np.ndarray  # [B, T, S, K] of the last T
-    deter: np.ndarray  # [B, T, D] of the last T
+    prior_logits: np.ndarray  # [B, T, S, K] of the last T steps
+    deter: np.ndarray  # [B, T, D] of the last T steps
     parts: dict[str, Any]
     given: Given
 
@@ -137,12 +137,12 @@ def forward(params, critic, batch, config, one_hots, given=None, alignment=None)
     """The loss of the world model.
 
     Args:
-      params: of the world model, in float64.
-      critic: its parameters, which do not learn here.
+      params: the world model's parameters, in float64.
+      critic: the critic's parameters, which do not learn here.
       batch: a `Trajectory` of numpy arrays with images, `[B, T + 1, ...]`.
       config: a `StormConfig` without dropout.
       one_hots: samples of posterior and prior.
-      given: see `Given`; of these parameters themselves if None.
+      given: see `Given`; computed from `params` if None.
       alignment: scales and weight of the value alignment, `(dynamics, representation)`.
     """
     obs = batch.obs[:, :-1]
@@ -188,7 +188,7 @@ def forward(params, critic, batch, config, one_hots, given=None, alignment=None)
     reward_logits, logits = (mlp(params[name], deter) for name in ("reward", "cont"))
     rewards, continues = [], []
     for b in range(count):
-        for t in range(length):  # h after step t tells what arrives at t + 1
+        for t in range(length):  # h after step t predicts what arrives at t + 1
             rewards.append(two_hot_cross_entropy(reward_logits[b, t], batch.reward[b, t + 1]))
             termination, ends = -logits[b, t, 0], batch.is_terminal[b, t + 1]
             continues.append(np.log1p(np.exp(termination)) - ends * termination)

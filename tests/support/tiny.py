@@ -1,7 +1,7 @@
-"""The one tiny configuration that tests share, so that its update is compiled once.
+"""The tiny configuration that tests share, so that its update is compiled once.
 
 `CONFIG` is a whole run in miniature: 2 environments, 8 collected steps and one update per
-chunk, in the probe of `env()`. Replay wraps, and its size does not change with `env_steps`.
+chunk, in the probe that `env()` makes. Replay wraps; its size does not depend on `env_steps`.
 """
 
 from __future__ import annotations

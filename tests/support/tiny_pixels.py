@@ -30,7 +30,7 @@ def config(images: str = "device", **changes: Any) -> Config:
 
 
 class Lamp:
-    """Episodes of 4 steps; a reward for the action that the lamp, left or right, shows."""
+    """Episodes of 4 steps; reward 1 for the action of the lamp's side: 0 left, 1 right."""
 
     obs = {"clock": vector(1), "picture": image(48)}  # noqa: RUF012
     action_size = 2
@@ -57,7 +57,7 @@ class Lamp:
 
 
 class Picture(Lamp):
-    """The lamp alone, no dict around it."""
+    """The picture of the lamp alone as the observation, without a dict."""
 
     obs = image(48)
 

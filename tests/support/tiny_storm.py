@@ -1,4 +1,4 @@
-"""The tiny configuration with STORM in the place of DreamerV3."""
+"""The tiny configuration with STORM instead of DreamerV3."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def config(**changes: Any) -> Config:
 
 
 def storm(like: Config, **changes: Any) -> Config:
-    """`like` with tiny STORM as its agent, and further changes."""
+    """`like` with tiny STORM as its agent, and with `changes`."""
     names = ("agent", "world_model", "actor", "critic", "imagination", "optimizer")
     return dataclasses.replace(
         like, **{name: getattr(CONFIG, name) for name in names} | changes
@@ -48,5 +48,5 @@ def storm(like: Config, **changes: Any) -> Config:
 
 
 def model(**changes: Any) -> StormConfig:
-    """Its world model, with some fields replaced."""
+    """The world model of `CONFIG`, with some fields replaced."""
     return dataclasses.replace(CONFIG.world_model, **changes)

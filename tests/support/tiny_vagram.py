@@ -1,4 +1,4 @@
-"""The tiny configuration with VaGraM in the place of DreamerV3."""
+"""The tiny configuration with VaGraM instead of DreamerV3."""
 
 import dataclasses
 

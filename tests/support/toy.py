@@ -1,4 +1,4 @@
-"""A `TrainState` in miniature and a step that counts, for tests of the host's side."""
+"""A miniature `TrainState`, for tests of code that runs on the host."""
 
 from typing import Any, NamedTuple
 
@@ -26,7 +26,7 @@ class State(NamedTuple):
 
 
 def state(seed=0, width=3):
-    """Every kind of leaf that a checkpoint meets."""
+    """A state with every kind of leaf that a checkpoint can hold."""
     rng = np.random.default_rng(seed)
 
     def normal(*shape):
@@ -51,7 +51,7 @@ def state(seed=0, width=3):
 
 
 def assert_equal(actual, expected):
-    """Bit for bit: structure, shapes, dtypes and values, keys and NaN included."""
+    """Compares bit for bit: structure, shapes, dtypes and values, keys and NaN included."""
     assert jax.tree.structure(actual) == jax.tree.structure(expected)
     for (path, a), e in zip(
         jax.tree_util.tree_leaves_with_path(actual), jax.tree.leaves(expected), strict=True

@@ -1,10 +1,10 @@
-"""Two-hot codes and log-softmax, slow and obvious, in float64."""
+"""Two-hot codes and log-softmax, written simply and slowly, in float64."""
 
 import numpy as np
 
 
 def slow_two_hot(y, bins):
-    """One float64 row per target, by search."""
+    """The two-hot code of each target: a float64 row, found by search."""
     bins = np.asarray(bins, np.float64)
     rows = np.zeros((len(y), len(bins)))
     for row, value in zip(rows, np.asarray(y, np.float64), strict=True):

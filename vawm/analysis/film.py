@@ -1,8 +1,8 @@
-"""Truth, imagination and value side by side, as a moving picture.
+"""Makes a film of truth, imagination and value, side by side.
 
-One window of an episode, as in `vawm.analysis.trajectories`: the world model observes the first
-steps, then follows the recorded actions without looking. The third panel is the map
-`vawm.analysis.saliency` calls `value`, at the states of the second.
+It shows one window of an episode, as in `vawm.analysis.trajectories`: the world model observes
+the first steps, then imagines the recorded actions without further observations. The third
+panel is the map `Saliency.value` of `vawm.analysis.saliency`, at the states of the second.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ from vawm.analysis.episodes import Episodes
 from vawm.policy import Policy
 from vawm.runs.reports import video
 
-PANEL = 256  # pixels of a panel's side, at least
+PANEL = 256  # least height of a panel, in pixels
 GAP, TITLE = 8, 28  # pixels between panels, and above them
 PAPER, INK = (255, 255, 255), (40, 40, 40)
 
 
 class Film(NamedTuple):
-    """T steps of one window, `context` of them observed; numpy.
+    """T steps of one window as numpy arrays; the world model observed the first `context`.
 
     Attributes:
-      truth: `[T, H, W, 3]` uint8, as observed.
-      imagined: `[T, H, W, 3]` uint8, as decoded.
-      value: `[T, H, W]`, how the decoded pixels move where V rises.
-      context: steps that were observed.
+      truth: `[T, H, W, 3]` uint8, the observed images.
+      imagined: `[T, H, W, 3]` uint8, the decoded images.
+      value: `[T, H, W]`, how much the decoded pixels change in the direction of rising V.
+      context: number of steps that the world model observed.
     """
 
     truth: np.ndarray
@@ -51,12 +51,13 @@ def make(
     seed: int,
     unit: saliency.Unit = "symlog",
 ) -> Film:
-    """The first window of `trajectories.imagine`, of a policy that observes images.
+    """Makes the film of the first window of `trajectories.imagine`.
 
-    It ends where its episode does, if that is shorter than `context + depth`.
+    The policy has to observe images. A window of an episode shorter than `context + depth` ends
+    with the episode.
 
     Raises:
-      InvalidInput: a depth or a context that cannot be imagined, see `inference.check`.
+      InvalidInput: `context` or `depth` cannot be imagined, see `inference.check`.
     """
     inference.check(policy.config, context=context, depth=depth)
     agent = make_agent(policy.config, policy.spec)
@@ -75,22 +76,22 @@ def make(
         jax.jit(compute)(policy.params, policy.state, key, batch, truth)
     )
     weight = saliency.images(truth, value)
-    assert weight is not None  # it observes images
+    assert weight is not None  # the policy observes images
     shown = jax.device_get(truth)
-    told = jax.tree.map(video.to_bytes, decoded, shown)
+    imagined = jax.tree.map(video.to_bytes, decoded, shown)
     steps = min(length, int(np.asarray(episodes.length)[0])) - 1
-    return Film(_pictures(shown)[:steps], _pictures(told)[:steps], weight[:steps], context)
+    return Film(_pictures(shown)[:steps], _pictures(imagined)[:steps], weight[:steps], context)
 
 
 def _pictures(obs) -> np.ndarray:
-    """All images side by side, `[T, H, W, 3]`."""
+    """All images of observations `[T, ...]` side by side, `[T, H, W, 3]`."""
     return video.side_by_side(jax.tree.map(lambda x: x[None], obs))[0]
 
 
 def frames(film: Film) -> np.ndarray:
-    """`[T, H, W, 3]` uint8: three panels, each with a title.
+    """The frames `[T, H, W, 3]` uint8: three panels, each with a title.
 
-    The border of the second is green while the world model observes, red while it imagines.
+    The second panel's border is green while the world model observes, red while it imagines.
     """
     scale = -(-PANEL // film.truth.shape[1])
     heat = figures.heat(film.imagined, film.value)
@@ -103,7 +104,7 @@ def frames(film: Film) -> np.ndarray:
 
 
 def _frame(pictures: tuple[np.ndarray, ...], ahead: int, scale: int) -> np.ndarray:
-    """One frame, `ahead` steps after the last one that was observed."""
+    """One frame, `ahead` steps after the last observed one."""
     height, width = (scale * side for side in pictures[0].shape[:2])
     color = video.IMAGINED if ahead > 0 else video.SEEN
     model = f"world model imagines, step {ahead}" if ahead > 0 else "world model observes"

@@ -64,10 +64,10 @@ def write_mp4(
 def write_gif(
     frames: np.ndarray, path: pathlib.Path, *, per_second: int, colors: int = 256
 ) -> None:
-    """An animated GIF of `[T, H, W, 3]` uint8 frames that repeats; needs no package.
+    """Writes `[T, H, W, 3]` uint8 frames as a GIF that repeats; needs no extra package.
 
-    All frames share one palette, made of every sixth, and are not dithered: both keep the file
-    small. An octree keeps colours that few pixels have.
+    All frames share one palette, made from every sixth frame, and are not dithered; both keep
+    the file small. The palette is an octree's, which keeps colours that few pixels have.
 
     Raises:
       OSError: the file could not be written.

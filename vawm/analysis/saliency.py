@@ -114,7 +114,7 @@ def make_saliency(
 
 
 def make_value(agent: Agent, *, unit: Unit) -> Callable[[Params, Latent], Array]:
-    """Build `value(params, latent) -> V` in `unit`, of any leading dims."""
+    """Builds `value(params, latent) -> V` in `unit`, for latents of any leading dims."""
     critic = agent.critic
 
     def value(params: Params, latent: Latent) -> Array:
@@ -131,7 +131,7 @@ def around(
     state: PyTree,
     latent: Latent,
 ) -> tuple[PyTree, Callable[[Array], PyTree], Array]:
-    """Decoder and value near F states, along the simplex of z.
+    """Linearises decoder and value at F states, along the simplex of z.
 
     Returns:
       The decoded observation, `push(v) = J v` with J = d o / d z, and dV/dz `[F, S, K]`.
@@ -142,7 +142,7 @@ def around(
         on_it = Latent(deter, on_simplex(stoch))
         return agent.world_model.predict(params.world_model, state, on_it).obs
 
-    # Rows do not meet in any network, so the gradient of the sum is that of each.
+    # No network mixes rows, so the gradient of the sum contains that of each row.
     slope = jax.grad(lambda z: value(params, Latent(deter, on_simplex(z))).sum())(stoch)
     return *forward(decode, stoch), slope
 
@@ -150,15 +150,15 @@ def around(
 def value_map(
     agent: Agent, *, unit: Unit = "symlog"
 ) -> Callable[[Params, PyTree, Latent, PyTree], tuple[PyTree, PyTree]]:
-    """Build `maps(params, state, latent, like) -> (decoded, value)` of any F states.
+    """Builds `maps(params, state, latent, like) -> (decoded, value)` for any F states.
 
     Args:
       agent: the agent.
-      unit: of V.
+      unit: the unit of V.
 
     Returns:
-      A function of states, imagined or inferred, and of F observations like theirs, which only
-      say what is an image. It returns `Saliency.decoded` and `Saliency.value` of the states.
+      A function of F imagined or inferred states and of F observations `like`, which only say
+      what is an image. It returns `Saliency.decoded` and `Saliency.value` of the states.
     """
     value = make_value(agent, unit=unit)
 

@@ -76,7 +76,7 @@ def imagine(
 def draw(
     episodes: Episodes, *, length: int, seed: int, at_most: int
 ) -> tuple[np.ndarray, Batch]:
-    """Where a window of `length` steps begins in each episode, and these windows."""
+    """Draws a window of `length` steps from each episode; returns their starts and them."""
     room = np.maximum(np.asarray(episodes.length)[:at_most] - length, 0)
     start = np.random.default_rng(seed).integers(room + 1)
     return start, windows(episodes, np.arange(len(start)), start, length=length)
