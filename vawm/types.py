@@ -1,14 +1,14 @@
 """The data of the package: every array lives in one of these NamedTuples.
 
-Time, once and for all. Everything at index t *arrived with* observation o_t; the action
-a_t leaves from it:
+One convention of time holds everywhere. Everything at index t *arrived with* observation o_t;
+the action a_t leaves from it:
 
     index            t                          t + 1
     arrives      o_t, r_t, flags_t   ->     o_{t+1}, r_{t+1}, flags_{t+1}
     leaves              a_t  ----------------^
     latent       s_t = (h_t, z_t)           h_{t+1} = f(h_t, z_t, a_t)
 
-So r_{t+1} is the reward *of* a_t, and the reward head reads it from s_{t+1}.
+So r_{t+1} is the reward *of* a_t, and the reward head predicts it from s_{t+1}.
 Shapes are `[B, T, ...]` for experience (replay order) and `[H, N, ...]` for imagination
 (scan order). Actions are float arrays `[..., action_size]`; discrete ones are one-hot.
 """
@@ -28,7 +28,7 @@ ArraySpec = jax.ShapeDtypeStruct
 
 
 IMAGE_SIZES = range(48, 257, 16)
-"""Sides of the images that the CNN takes: halved four times they are 3 to 16 pixels."""
+"""Sizes of the images that the CNNs read: halved four times, they are 3 to 16 pixels wide."""
 
 
 def vector(size: int) -> ArraySpec:
@@ -42,12 +42,12 @@ def image(size: int, channels: int = 3) -> ArraySpec:
 
 
 def is_image(obs: Any) -> bool:
-    """Whether an array or `ArraySpec` holds pixels: all bytes do, and nothing else."""
+    """Whether an array or `ArraySpec` holds pixels: it does if it is uint8."""
     return obs.dtype == jnp.uint8
 
 
 class EnvSpec(NamedTuple):
-    """What an agent has to know of an environment; all static.
+    """What an agent must know about an environment; all static.
 
     Attributes:
       task: name of the task, such as "walker_walk".
@@ -55,9 +55,9 @@ class EnvSpec(NamedTuple):
         vectors `[D]`, uint8 images `[size, size, channels]`.
       action_size: width of the action vector, or number of discrete actions.
       discrete: whether actions are one-hot choices.
-      num_envs: N, environments stepped at once.
+      num_envs: N, environments that are stepped together.
       action_repeat: control steps per call of `step`.
-      episode_length: calls of `step` in one full episode; None where it varies.
+      episode_length: calls of `step` in a full episode; None if it varies.
     """
 
     task: str
@@ -72,9 +72,9 @@ class EnvSpec(NamedTuple):
 class TimeStep(NamedTuple):
     """What arrives with o_t, for N environments.
 
-    `is_last` ends an episode for any reason, `is_terminal` only where the return truly
-    ends (no bootstrap). The step after `is_last` is a reset: its action is ignored, its
-    reward is 0 and it carries `is_first`.
+    `is_last` marks the end of an episode for any reason, `is_terminal` only an end of the
+    return itself (no bootstrap). The step after `is_last` is a reset: the action before it is
+    ignored, its reward is 0 and it has `is_first`.
     """
 
     obs: PyTree  # [N, ...] as EnvSpec.obs says
@@ -85,7 +85,7 @@ class TimeStep(NamedTuple):
 
 
 class Trajectory(NamedTuple):
-    """A `TimeStep` and the raw action that left from it, `[B, T, ...]`."""
+    """Each `TimeStep` with the raw action that left from it, `[B, T, ...]`."""
 
     obs: PyTree
     reward: Array
@@ -99,7 +99,7 @@ class Latent(NamedTuple):
     """s_t = (h_t, z_t)."""
 
     deter: Array  # [..., D]
-    stoch: Array  # [..., S, K] one-hot, straight-through; or probabilities, if deterministic
+    stoch: Array  # [..., S, K] one-hot, straight-through; deterministic models: probabilities
 
 
 def flat_stoch(stoch: Array) -> Array:
@@ -107,11 +107,16 @@ def flat_stoch(stoch: Array) -> Array:
     return stoch.reshape(*stoch.shape[:-2], -1)
 
 
+def features(latent: Latent) -> tuple[Array, Array]:
+    """[h, z] as the two inputs of a network: `[..., D]` and `[..., S * K]`."""
+    return latent.deter, flat_stoch(latent.stoch)
+
+
 class Inference(NamedTuple):
     """States that a world model has both inferred and predicted, `[B, T, ...]`.
 
-    `latent` and `prior_latent` share h_t; their z_t is drawn from the posterior and from the
-    prior. Logits are before unimix.
+    `latent` and `prior_latent` have the same h_t. Their z_t come from the posterior and from
+    the prior. Logits are before unimix.
     """
 
     latent: Latent
@@ -128,38 +133,49 @@ class Imagined(NamedTuple):
 
 
 class Predictions(NamedTuple):
-    """What the heads read from a latent, any leading dims."""
+    """What the heads predict from a latent, any leading dims.
+
+    A world model without a decoder predicts `()` as `obs`.
+    """
 
     obs: PyTree  # as EnvSpec.obs: symlog units for vectors, [0, 1] for images
     reward: Array  # [..., bins] logits of the two-hot code
-    cont: Array  # [...] logit of P(not terminal), times the discount where that is learned too
-
-
-class Explanation(NamedTuple):
-    """What a world model makes of a batch: what it inferred, and what its heads read there.
-
-    Which steps have what depends on the model: `predictions` and `targets` agree entry by
-    entry, and each field of theirs may cover other steps than `inference` does.
-    """
-
-    inference: Inference
-    predictions: Predictions
-    targets: Targets
+    cont: Array  # [...] logit of P(not terminal), or of the discount times it
 
 
 class Targets(NamedTuple):
-    """What arrived, where `Predictions` says what should have."""
+    """What arrived: the truth for `Predictions`, entry by entry."""
 
     obs: PyTree
     reward: Array
     is_terminal: Array
 
 
+class Explanation(NamedTuple):
+    """How a world model explains a batch.
+
+    `predictions` and `targets` agree entry by entry. The world model chooses which steps each
+    of their fields covers; they may differ from the steps of `inference`.
+
+    Attributes:
+      inference: the states that it inferred and predicted.
+      predictions: what its heads predict.
+      targets: what they should predict.
+      losses: further losses of this world model by name, `[B, T]` or scalar, with their
+        scales. They are added to the loss and logged as `loss/<name>`.
+    """
+
+    inference: Inference
+    predictions: Predictions
+    targets: Targets
+    losses: dict[str, Array] = {}  # noqa: RUF012
+
+
 class Batch(NamedTuple):
     """Sequences of experience: T + 1 steps, the first of which only gives context.
 
-    What that is depends on the world model: the latent that was stored beside the first step,
-    or the step itself.
+    What the context is depends on the world model: the latent that was stored beside the first
+    step, or the step itself.
     """
 
     trajectory: Trajectory  # [B, T + 1, ...]
@@ -167,7 +183,7 @@ class Batch(NamedTuple):
 
 
 class Params(NamedTuple):
-    """All that is learned by gradient."""
+    """Everything that is learned by gradient."""
 
     world_model: PyTree
     actor: PyTree

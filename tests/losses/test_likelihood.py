@@ -314,6 +314,15 @@ def test_prediction_loss_sums_over_observations():
     np.testing.assert_allclose(actual.reconstruction, sum(apart), rtol=1e-5)
 
 
+def test_prediction_loss_without_observations_is_that_of_reward_and_continuation():
+    arrays = heads_and_targets(observations()[0])
+    nothing = prediction_loss((), *arrays[1:3], (), *arrays[4:], bins=BINS, discount=0.9)
+    usual = prediction_loss(*arrays, bins=BINS, discount=0.9)
+    np.testing.assert_array_equal(nothing.reconstruction, np.zeros((2, 3)))
+    np.testing.assert_array_equal(nothing.reward, usual.reward)
+    np.testing.assert_array_equal(nothing.cont, usual.cont)
+
+
 def test_prediction_loss_by_hand():
     bins = jnp.array([-1.0, 0.0, 1.0])
     loss = losses.prediction_loss(

@@ -14,7 +14,7 @@ from vawm.distributions import ActionDistribution
 from vawm.errors import InvalidInput
 from vawm.losses import transforms
 from vawm.losses.transforms import TwoHot
-from vawm.types import Array, EnvSpec, Key, Latent, PyTree, flat_stoch
+from vawm.types import Array, EnvSpec, Key, Latent, PyTree, features
 
 
 class Actor(NamedTuple):
@@ -37,11 +37,6 @@ class Critic(NamedTuple):
     init: Callable[[Key], PyTree]
     logits: Callable[[PyTree, Latent], Array]  # [..., bins]
     code: TwoHot  # values as logits over bins, and back
-
-
-def features(latent: Latent) -> tuple[Array, Array]:
-    """[h, z] as the two inputs of a network."""
-    return latent.deter, flat_stoch(latent.stoch)
 
 
 def make_actor(

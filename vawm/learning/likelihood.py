@@ -36,11 +36,12 @@ def make_likelihood(config: Config) -> Callable[[Explanation], Likelihood]:
     def likelihood(explanation: Explanation) -> Likelihood:
         inference = explanation.inference
         predictions, targets = explanation.predictions, explanation.targets
+        has_decoder = len(jax.tree.leaves(predictions.obs)) > 0
         prediction = losses.prediction_loss(
             predictions.obs,
             predictions.reward,
             predictions.cont,
-            targets.obs,
+            targets.obs if has_decoder else (),
             reward_code.encode(targets.reward),
             targets.is_terminal,
             bins=reward_code.bins,
@@ -60,6 +61,8 @@ def make_likelihood(config: Config) -> Callable[[Explanation], Likelihood]:
             "continue": prediction.cont,
             "dynamics": dynamics,
         }
+        if not has_decoder:
+            del parts["reconstruction"]
         return Likelihood(parts, kl)
 
     return likelihood

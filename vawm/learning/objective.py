@@ -24,13 +24,24 @@ import jax.numpy as jnp
 from vawm import losses
 from vawm.agent import Agent
 from vawm.config import Config
+from vawm.errors import InvalidInput
 from vawm.learning.alignment import alignment_metrics, make_value_alignment, warmup_step
 from vawm.learning.discount import discount_of
 from vawm.learning.foresight import Foresight, imagination_metrics, make_foresight
 from vawm.learning.likelihood import latent_metrics, make_likelihood
 from vawm.learning.state import Learner
 from vawm.losses import returns
-from vawm.types import Array, Batch, Inference, Key, Latent, Metrics, Params, PyTree
+from vawm.types import (
+    Array,
+    Batch,
+    Explanation,
+    Inference,
+    Key,
+    Latent,
+    Metrics,
+    Params,
+    PyTree,
+)
 
 
 class Explained(NamedTuple):
@@ -48,6 +59,20 @@ class Behaved(NamedTuple):
     metrics: Metrics
 
 
+NAMES = {
+    "reconstruction",
+    "reward",
+    "continue",
+    "dynamics",
+    "value_gradient",
+    "value_alignment",
+    "actor",
+    "critic",
+    "replay_critic",
+    "total",
+}
+"""Our own losses. A further loss of a world model needs another name."""
+
 WorldModelLoss = Callable[[Params, Learner, Batch, Key, Array], tuple[Array, Explained]]
 BehaviourLoss = Callable[
     [Params, Learner, Batch, Inference, PyTree, Key], tuple[Array, Behaved]
@@ -57,8 +82,12 @@ BehaviourLoss = Callable[
 def make_world_model_loss(agent: Agent, config: Config) -> WorldModelLoss:
     """Build `world_model_loss(params, learner, batch, key, env_steps) -> (loss, Explained)`.
 
-    Eq. 2: prediction, dynamics and value alignment of a batch. Gradients reach the world model
-    only. Of the learner it uses `model_state`, the slow critic and the number of updates.
+    Eq. 2: prediction, dynamics and value alignment of a batch; and the further losses that a
+    world model or an agent has. Gradients reach the world model only. Of the learner it uses
+    `model_state`, the slow critic and the number of updates.
+
+    Raises:
+      InvalidInput: in the first call, when a further loss has the name of one of ours.
     """
     likelihood = make_likelihood(config)
     value_alignment = make_value_alignment(agent, config)
@@ -80,7 +109,7 @@ def make_world_model_loss(agent: Agent, config: Config) -> WorldModelLoss:
         step = warmup_step(config, learner, env_steps)
         aligned = value_alignment(critic, inference, likely.kl, step)
 
-        parts = likely.losses
+        parts = likely.losses | further_losses(explanation)
         if agent.latent_loss is not None:
             value_gradient = agent.latent_loss(params.critic, learner.slow_critic, inference)
             parts = parts | {"value_gradient": value_gradient}
@@ -92,6 +121,14 @@ def make_world_model_loss(agent: Agent, config: Config) -> WorldModelLoss:
         return total(parts, only_logged), explained
 
     return world_model_loss
+
+
+def further_losses(explanation: Explanation) -> dict[str, Array]:
+    """The losses that a world model has besides Eq. 2; refuses names that are taken."""
+    for name in explanation.losses:
+        if name in NAMES:
+            raise InvalidInput("Explanation.losses", name, "is taken; use another name")
+    return explanation.losses
 
 
 def make_behaviour_loss(agent: Agent, config: Config) -> BehaviourLoss:

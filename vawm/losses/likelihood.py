@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any, NamedTuple
 
 import chex
@@ -50,7 +51,7 @@ def prediction_loss(
 
     Args:
       obs_prediction: `[..., D]` in symlog units, or `[..., H, W, C]` in [0, 1] for images; or
-        a tree of these, whose losses are summed.
+        a tree of these, whose losses are summed; `()` for none, with a loss of 0.
       reward_logits: `[..., bins]`.
       cont_logit: `[...]`.
       obs: `[..., D]` floats in raw units, or `[..., H, W, C]` uint8; the same tree.
@@ -69,11 +70,12 @@ def prediction_loss(
     """
     chex.assert_equal_shape([cont_logit, reward, is_terminal])
     chex.assert_trees_all_equal_structs(obs_prediction, obs)
-    parts = jax.tree.map(reconstruction_loss, obs_prediction, obs)
-    chex.assert_equal_shape([cont_logit, *jax.tree.leaves(parts)])
-    reconstruction = jax.tree.reduce(jnp.add, parts)
+    parts = jax.tree.leaves(jax.tree.map(reconstruction_loss, obs_prediction, obs))
+    chex.assert_equal_shape([cont_logit, *parts])
+    if len(parts) == 0:
+        parts = [jnp.zeros_like(cont_logit)]
     return PredictionLoss(
-        reconstruction=reconstruction,
+        reconstruction=functools.reduce(jnp.add, parts),
         reward=two_hot_cross_entropy(reward_logits, reward, bins),
         cont=continue_loss(cont_logit, discount * (1.0 - is_terminal)),
     )
