@@ -72,7 +72,7 @@ def slow_loss(critic, unit, scale):
 @pytest.mark.parametrize("unit", ["symlog", "raw"])
 def test_the_loss_equals_a_loop_over_the_entries_of_z(unit):
     choices = model(value_gradient_unit=unit, value_gradient_scale=0.3)
-    loss = jax.jit(make_value_gradient_loss(SIMPLE.critic, choices))
+    loss = jax.jit(make_value_gradient_loss(SIMPLE, choices))
     actual = loss(jnp.float32(1.5), jnp.float32(0.5), inference())
     expected = sum(slow_loss(critic, unit, 0.3) for critic in (1.5, 0.5)) / 2
     np.testing.assert_allclose(actual, expected, rtol=2e-4)
@@ -80,7 +80,7 @@ def test_the_loss_equals_a_loop_over_the_entries_of_z(unit):
 
 @pytest.mark.parametrize(("critic", "number"), [("online", 1.5), ("slow", 0.5)])
 def test_either_critic_alone_can_judge(critic, number):
-    loss = make_value_gradient_loss(SIMPLE.critic, model(value_gradient_critic=critic))
+    loss = make_value_gradient_loss(SIMPLE, model(value_gradient_critic=critic))
     actual = loss(jnp.float32(1.5), jnp.float32(0.5), inference())
     np.testing.assert_allclose(actual, slow_loss(number, "symlog", 1.0), rtol=2e-4)
 
@@ -99,7 +99,7 @@ def test_the_other_forms_are_those_of_the_library(form, function):
         value_gradient_critic="online",
         unimix=0.0,
     )
-    actual = make_value_gradient_loss(SIMPLE.critic, choices)(jnp.float32(2), (), inference())
+    actual = make_value_gradient_loss(SIMPLE, choices)(jnp.float32(2), (), inference())
     inferred = inference()
     h = inferred.latent.deter.mean(-1)
     flat = [x.stoch.reshape(*SHAPE, 16) for x in (inferred.prior_latent, inferred.latent)]
@@ -115,7 +115,7 @@ def test_the_joint_form_equals_its_derivatives_by_hand():
         value_gradient_critic="online",
         unimix=0.0,
     )
-    actual = make_value_gradient_loss(SIMPLE.critic, choices)(jnp.float32(2), (), inference())
+    actual = make_value_gradient_loss(SIMPLE, choices)(jnp.float32(2), (), inference())
     inferred = jax.tree.map(lambda x: np.asarray(x, np.float64), inference())
     h = inferred.latent.deter.mean(-1)[..., None]
     z, guess = (x.stoch.reshape(*SHAPE, 16) for x in (inferred.latent, inferred.prior_latent))
@@ -135,7 +135,7 @@ def test_a_critic_that_ignores_z_has_no_loss(form):
             p * latent.stoch.sum(-1) @ jnp.arange(1.0, 5.0) * latent.deter.mean(-1)
         )[..., None]
     )
-    loss = make_value_gradient_loss(ignoring.critic, model(value_gradient_form=form))
+    loss = make_value_gradient_loss(ignoring, model(value_gradient_form=form))
     np.testing.assert_allclose(loss(jnp.float32(2), jnp.float32(3), inference()), 0, atol=1e-9)
 
 
@@ -145,11 +145,11 @@ def gradient(**changes):
     config = dataclasses.replace(CONFIG, world_model=model(**changes))
     agent = make_agent(config, SPEC)
     loss = objective.make_world_model_loss(agent, config)
-    params, state = jax.jit(agent.init)(jax.random.key(0))
+    params, model_state = jax.jit(agent.init)(jax.random.key(0))
     params = noisy(params)
 
     def total(params, slow):
-        given = learner(params, model_state=state, slow_critic=slow)
+        given = learner(params, model_state=model_state, slow_critic=slow)
         return loss(params, given, batch(agent), jax.random.key(1), jnp.asarray(1))
 
     run = jax.jit(jax.grad(total, has_aux=True, argnums=(0, 1)))
@@ -182,12 +182,12 @@ def test_from_pixels_it_alone_trains_the_prior_and_every_layer_of_the_encoder():
 
     @jax.jit
     def gradient(key):
-        params, state = agent.init(key)
+        params, model_state = agent.init(key)
         params = noisy(params)
 
         def loss(world_model):
             explained, _ = agent.world_model.explain(
-                world_model, state, jax.random.key(1), data
+                world_model, model_state, jax.random.key(1), data
             )
             return vagram(params.critic, params.critic, explained.inference).mean()
 
@@ -224,10 +224,12 @@ def test_the_decoder_only_shows_what_rewards_and_values_have_made_of_the_latents
 
 
 def test_nothing_is_random_but_actions():
-    params, state = jax.jit(AGENT.init)(jax.random.key(0))
+    params, model_state = jax.jit(AGENT.init)(jax.random.key(0))
     params, world_model = noisy(params).world_model, AGENT.world_model
     first, again = (
-        world_model.explain(params, state, jax.random.key(seed), batch(AGENT))[0].inference
+        world_model.explain(params, model_state, jax.random.key(seed), batch(AGENT))[
+            0
+        ].inference
         for seed in (1, 2)
     )
     jax.tree.map(np.testing.assert_array_equal, first, again)

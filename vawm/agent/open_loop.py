@@ -1,4 +1,4 @@
-"""Open-loop prediction: what the world model expects after it has seen a few steps."""
+"""Open-loop prediction: what the world model predicts after it has seen a few steps."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from vawm.types import Array, Batch, Key, Latent, Params, PyTree
 
 
 class OpenLoop(NamedTuple):
-    """Observations as the decoder tells them, `[B, T, ...]`, beside those of the batch."""
+    """Decoded observations, `[B, T, ...]`, one for each of the batch."""
 
     predicted: PyTree  # in the decoder's units: symlog for vectors, [0, 1] for images
-    same_episode: Array  # [B, T] bool, whether no reset lies between the context and here
+    same_episode: Array  # [B, T] bool, whether no reset lies between the context and this step
 
 
 def make_open_loop(agent: Agent, *, context: int) -> Callable[..., OpenLoop]:
-    """Build `open_loop(params, state, key, batch) -> OpenLoop`.
+    """Build `open_loop(params, model_state, key, batch) -> OpenLoop`.
 
-    The first `context` of the T steps are observed, and decoded from their posterior. The
-    others are imagined with the batch's own actions and never looked at. No gradient.
+    The first `context` of the T steps are observed and decoded from the posterior. The others
+    are imagined with the actions of the batch, without their observations.
     """
     world_model = agent.world_model
 
-    def decode(params: Params, state: PyTree, latent: Latent) -> PyTree:
-        return world_model.predict(params.world_model, state, latent).obs
+    def decode(params: Params, model_state: PyTree, latent: Latent) -> PyTree:
+        return world_model.predict(params.world_model, model_state, latent).obs
 
-    def open_loop(params: Params, state: PyTree, key: Key, batch: Batch) -> OpenLoop:
+    def open_loop(params: Params, model_state: PyTree, key: Key, batch: Batch) -> OpenLoop:
         model = params.world_model
         key_follow, key_imagine = jax.random.split(key)
         steps = batch.trajectory
@@ -38,18 +38,18 @@ def make_open_loop(agent: Agent, *, context: int) -> Callable[..., OpenLoop]:
         action = steps.action[:, context + 1 : -1].swapaxes(0, 1)
         left = action.shape[0]
         inferred, (carry, first) = world_model.follow(
-            model, state, key_follow, seen, horizon=left
+            model, model_state, key_follow, seen, horizon=left
         )
 
         def imagine(carry: PyTree, inputs: tuple[Array, Key]):
             action, key = inputs
-            return world_model.imagine(model, state, key, carry, action)
+            return world_model.imagine(model, model_state, key, carry, action)
 
         _, latent = jax.lax.scan(imagine, carry, (action, jax.random.split(key_imagine, left)))
         imagined = jax.tree.map(
             lambda a, b: jnp.concatenate([a[:, None], b.swapaxes(0, 1)], axis=1), first, latent
         )
-        parts = decode(params, state, inferred), decode(params, state, imagined)
+        parts = decode(params, model_state, inferred), decode(params, model_state, imagined)
         resets = jnp.cumsum(steps.is_first[:, 1:].astype(jnp.int32), axis=1)
         return OpenLoop(
             predicted=jax.tree.map(lambda a, b: jnp.concatenate([a, b], axis=1), *parts),
