@@ -79,21 +79,21 @@ def observation(agent, is_first, is_last):
 
 def test_acting_is_pure_and_depends_on_the_key():
     agent = make_agent(tiny.CONFIG, tiny.env().spec)
-    (params, state), carry = agent.init(jax.random.key(0)), agent.initial(2)
+    (params, model_state), carry = agent.init(jax.random.key(0)), agent.initial(2)
     timestep = observation(agent, [True, True], [False, False])
     act = jax.jit(agent.act)
-    first = act(params, state, jax.random.key(1), carry, timestep)
-    again = act(params, state, jax.random.key(1), carry, timestep)
-    other = act(params, state, jax.random.key(2), carry, timestep)
+    first = act(params, model_state, jax.random.key(1), carry, timestep)
+    again = act(params, model_state, jax.random.key(1), carry, timestep)
+    other = act(params, model_state, jax.random.key(2), carry, timestep)
     jax.tree.map(np.testing.assert_array_equal, first, again)
     assert (first[1] != other[1]).all()
 
 
 def test_nothing_leaves_from_a_last_observation():
     agent = make_agent(tiny.CONFIG, tiny.env().spec)
-    (params, state), carry = agent.init(jax.random.key(0)), agent.initial(2)
+    (params, model_state), carry = agent.init(jax.random.key(0)), agent.initial(2)
     timestep = observation(agent, [False, False], [True, False])
-    carry, action = agent.act(params, state, jax.random.key(1), carry, timestep)
+    carry, action = agent.act(params, model_state, jax.random.key(1), carry, timestep)
     assert (action[0] == 0).all()
     assert (action[1] != 0).all()
     np.testing.assert_array_equal(carry.action, action)
@@ -101,11 +101,11 @@ def test_nothing_leaves_from_a_last_observation():
 
 def test_a_first_observation_clears_what_was_remembered():
     agent = make_agent(tiny.CONFIG, tiny.env().spec)
-    (params, state), fresh = agent.init(jax.random.key(0)), agent.initial(2)
+    (params, model_state), fresh = agent.init(jax.random.key(0)), agent.initial(2)
     full = jax.tree.map(jnp.ones_like, fresh)
     timestep = observation(agent, [True, False], [False, False])
-    _, expected = agent.act(params, state, jax.random.key(1), fresh, timestep)
-    _, actual = agent.act(params, state, jax.random.key(1), full, timestep)
+    _, expected = agent.act(params, model_state, jax.random.key(1), fresh, timestep)
+    _, actual = agent.act(params, model_state, jax.random.key(1), full, timestep)
     np.testing.assert_array_equal(actual[0], expected[0])
     assert (actual[1] != expected[1]).any()
 
@@ -140,13 +140,13 @@ def discrete_agent(temperature=1.0):
 
 def choices(agent, how, seed=1):
     """Actions of 256 environments that look all the same."""
-    params, state = agent.init(jax.random.key(0))
+    params, model_state = agent.init(jax.random.key(0))
     logits = params.actor["heads_0"]["bias"]
     params.actor["heads_0"]["bias"] = jnp.array([0.0, 1.0]).astype(logits.dtype)
     no = jnp.zeros(256, bool)
     timestep = TimeStep(jnp.zeros((256, 2)), jnp.zeros(256), ~no, no, no)
     _, action = agent.act(
-        params, state, jax.random.key(seed), agent.initial(256), timestep, how=how
+        params, model_state, jax.random.key(seed), agent.initial(256), timestep, how=how
     )
     return np.asarray(action)
 

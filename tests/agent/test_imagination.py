@@ -18,8 +18,8 @@ from vawm.world_model.protocol import WorldModel
 def counting_model():
     """h' = h + a, z unchanged."""
 
-    def step(params, state, key, carry, action):
-        del state, key
+    def step(params, model_state, key, carry, action):
+        del model_state, key
         latent = Latent(carry.deter + params * action, carry.stoch)
         return latent, latent
 
@@ -62,12 +62,19 @@ def test_steps_and_states_draw_different_noise():
 
     @jax.jit
     def roll(key):
-        params, state = agent.init(jax.random.key(0))
+        params, model_state = agent.init(jax.random.key(0))
         start = agent.world_model.initial(2)
         carry = jnp.zeros((4, 2, 8)), start
         policy = functools.partial(agent.actor.policy, params.actor)
         return imagine(
-            agent.world_model, policy, params.world_model, state, key, carry, start, horizon=3
+            agent.world_model,
+            policy,
+            params.world_model,
+            model_state,
+            key,
+            carry,
+            start,
+            horizon=3,
         )
 
     imagined = roll(jax.random.key(1))

@@ -34,9 +34,9 @@ def batch(agent, seed=0, first=()):
     return Batch(trajectory, agent.world_model.memory(agent.world_model.initial(BATCH)))
 
 
-def predict(agent, data, params, state):
+def predict(agent, data, params, model_state):
     open_loop = jax.jit(make_open_loop(agent, context=CONTEXT))
-    return open_loop(params, state, jax.random.key(1), data)
+    return open_loop(params, model_state, jax.random.key(1), data)
 
 
 def test_by_hand_on_the_scalar_agent():
@@ -55,11 +55,11 @@ def test_by_hand_on_the_scalar_agent():
 def mixed():
     spec = EnvSpec("test", {"a": image(48), "b": vector(2)}, 3, False, 2, 1, None)
     agent = make_agent(tiny.CONFIG, spec)
-    params, state = agent.init(jax.random.key(0))
+    params, model_state = agent.init(jax.random.key(0))
     # So that samples of z follow what is seen, and not their noise alone.
     out = params.world_model["rssm"]["posterior_out"]
     params.world_model["rssm"]["posterior_out"] = jax.tree.map(lambda x: 100 * x, out)
-    return agent, params, state
+    return agent, params, model_state
 
 
 def test_what_comes_after_the_context_is_never_looked_at(mixed):

@@ -145,11 +145,11 @@ def gradient(**changes):
     config = dataclasses.replace(CONFIG, world_model=model(**changes))
     agent = make_agent(config, SPEC)
     loss = objective.make_world_model_loss(agent, config)
-    params, state = jax.jit(agent.init)(jax.random.key(0))
+    params, model_state = jax.jit(agent.init)(jax.random.key(0))
     params = noisy(params)
 
     def total(params, slow):
-        given = learner(params, model_state=state, slow_critic=slow)
+        given = learner(params, model_state=model_state, slow_critic=slow)
         return loss(params, given, batch(agent), jax.random.key(1), jnp.asarray(1))
 
     run = jax.jit(jax.grad(total, has_aux=True, argnums=(0, 1)))
@@ -182,12 +182,12 @@ def test_from_pixels_it_alone_trains_the_prior_and_every_layer_of_the_encoder():
 
     @jax.jit
     def gradient(key):
-        params, state = agent.init(key)
+        params, model_state = agent.init(key)
         params = noisy(params)
 
         def loss(world_model):
             explained, _ = agent.world_model.explain(
-                world_model, state, jax.random.key(1), data
+                world_model, model_state, jax.random.key(1), data
             )
             return vagram(params.critic, params.critic, explained.inference).mean()
 
@@ -224,10 +224,12 @@ def test_the_decoder_only_shows_what_rewards_and_values_have_made_of_the_latents
 
 
 def test_nothing_is_random_but_actions():
-    params, state = jax.jit(AGENT.init)(jax.random.key(0))
+    params, model_state = jax.jit(AGENT.init)(jax.random.key(0))
     params, world_model = noisy(params).world_model, AGENT.world_model
     first, again = (
-        world_model.explain(params, state, jax.random.key(seed), batch(AGENT))[0].inference
+        world_model.explain(params, model_state, jax.random.key(seed), batch(AGENT))[
+            0
+        ].inference
         for seed in (1, 2)
     )
     jax.tree.map(np.testing.assert_array_equal, first, again)

@@ -87,30 +87,32 @@ def observe(batch):
     return steps, inference(h, jnp.zeros_like(h))
 
 
-def explain(params, state, key, batch):
+def explain(params, model_state, key, batch):
     steps, inferred = observe(batch)
     targets = Targets(steps.obs, steps.reward, steps.is_terminal)
-    return Explanation(inferred, predict(params, state, inferred.latent), targets), state
+    return Explanation(
+        inferred, predict(params, model_state, inferred.latent), targets
+    ), model_state
 
 
-def starts(params, state, inference):
+def starts(params, model_state, inference):
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), inference.latent)
     return flat, flat
 
 
-def follow(params, state, key, batch, *, horizon):
+def follow(params, model_state, key, batch, *, horizon):
     inferred = observe(batch)[1].latent
     last = jax.tree.map(lambda x: x[:, -1], inferred)
-    return inferred, imagine(params, state, key, last, batch.trajectory.action[:, -1])
+    return inferred, imagine(params, model_state, key, last, batch.trajectory.action[:, -1])
 
 
-def imagine(params, state, key, carry, action):
+def imagine(params, model_state, key, carry, action):
     h, z = numbers(carry)
     following = latent(h + action[..., 0], jnp.zeros_like(z))
     return following, following
 
 
-def predict(params, state, latent):
+def predict(params, model_state, latent):
     h, z = numbers(latent)
     return Predictions(obs=h[..., None], reward=around(params * h), cont=2 + h - 40 * z)
 

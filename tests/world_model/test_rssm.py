@@ -17,9 +17,9 @@ BATCH, LENGTH = 3, 6
 
 def make(noise="independent"):
     model = rssm(CONFIG, SPEC, noise=noise)
-    params, state = model.init(jax.random.key(0))
-    assert not jax.tree.leaves(state)  # nothing is carried
-    return model, noisy(params), state
+    params, model_state = model.init(jax.random.key(0))
+    assert not jax.tree.leaves(model_state)  # nothing is carried
+    return model, noisy(params), model_state
 
 
 def experience():
@@ -44,11 +44,11 @@ def batch(carry, obs, prev_action, is_first):
     return Batch(trajectory, pack(carry))
 
 
-def explain(model, params, state, *, key=2):
+def explain(model, params, model_state, *, key=2):
     """What `model` makes of `experience()`."""
     data = batch(start(model), *experience())
-    explanation, after = model.explain(params, state, jax.random.key(key), data)
-    assert jax.tree.structure(after) == jax.tree.structure(state)
+    explanation, after = model.explain(params, model_state, jax.random.key(key), data)
+    assert jax.tree.structure(after) == jax.tree.structure(model_state)
     return explanation
 
 
@@ -76,9 +76,9 @@ def logits(params, x):
 
 
 def test_what_is_inferred_matches_the_recursion_given_its_samples():
-    model, params, state = make()
+    model, params, model_state = make()
     obs, prev_action, is_first = experience()
-    inference = explain(model, params, state).inference
+    inference = explain(model, params, model_state).inference
     p, rssm_p = float64(params), float64(params["rssm"])
     tokens = mlp(p["encoder"]["vector"], symlog(np.asarray(obs, np.float64)))
     deter, stoch = (np.asarray(x, np.float64) for x in start(model))
@@ -98,12 +98,13 @@ def test_what_is_inferred_matches_the_recursion_given_its_samples():
 
 
 def test_the_heads_read_what_is_inferred_at_the_steps_after_the_first():
-    model, params, state = make()
-    inference, predictions, targets = explain(model, params, state)
+    model, params, model_state = make()
+    inference, predictions, targets, further = explain(model, params, model_state)
+    assert further == {}
     jax.tree.map(
         np.testing.assert_array_equal,
         predictions,
-        model.predict(params, state, inference.latent),
+        model.predict(params, model_state, inference.latent),
     )
     obs, _, is_first = experience()
     np.testing.assert_array_equal(targets.obs, obs)
@@ -112,12 +113,12 @@ def test_the_heads_read_what_is_inferred_at_the_steps_after_the_first():
 
 
 def test_filtering_one_step_is_explaining_a_sequence_of_one():
-    model, params, state = make()
+    model, params, model_state = make()
     one_step = jax.tree.map(lambda x: x[:, 2:3], experience())
     data = batch(start(model), *one_step)
-    explanation, _ = model.explain(params, state, jax.random.key(2), data)
+    explanation, _ = model.explain(params, model_state, jax.random.key(2), data)
     now = jax.tree.map(lambda x: x[:, 0], one_step)
-    carry, latent = model.filter(params, state, jax.random.key(2), start(model), *now)
+    carry, latent = model.filter(params, model_state, jax.random.key(2), start(model), *now)
     expected = jax.tree.map(lambda x: x[:, 0], explanation.inference.latent)
     jax.tree.map(np.testing.assert_array_equal, latent, expected)
     jax.tree.map(np.testing.assert_array_equal, model.memory(carry), pack(latent))
@@ -125,19 +126,19 @@ def test_filtering_one_step_is_explaining_a_sequence_of_one():
 
 
 def test_filtering_goes_on_from_what_it_remembers():
-    model, params, state = make()
-    inference = explain(model, params, state).inference
+    model, params, model_state = make()
+    inference = explain(model, params, model_state).inference
     carry = start(model)
     for t in range(LENGTH):
         now = jax.tree.map(lambda x, t=t: x[:, t], experience())
-        _, latent = model.filter(params, state, jax.random.key(t), carry, *now)
+        _, latent = model.filter(params, model_state, jax.random.key(t), carry, *now)
         np.testing.assert_allclose(latent.deter, inference.latent.deter[:, t], atol=1e-6)
         carry = jax.tree.map(lambda x, t=t: x[:, t], inference.latent)
 
 
 def test_prior_and_posterior_share_h_and_are_one_hot():
-    model, params, state = make()
-    inference = explain(model, params, state).inference
+    model, params, model_state = make()
+    inference = explain(model, params, model_state).inference
     np.testing.assert_array_equal(inference.latent.deter, inference.prior_latent.deter)
     for stoch in (inference.latent.stoch, inference.prior_latent.stoch):
         np.testing.assert_array_equal(np.sort(stoch, -1)[..., -1], 1.0)
@@ -146,26 +147,26 @@ def test_prior_and_posterior_share_h_and_are_one_hot():
 
 def test_shared_noise_gives_equal_samples_where_prior_equals_posterior():
     for noise, equal in (("shared", True), ("independent", False)):
-        model, params, state = make(noise)
+        model, params, model_state = make(noise)
         params["rssm"]["posterior_out"] = jax.tree.map(
             jnp.zeros_like, params["rssm"]["posterior_out"]
         )
         prior_out = params["rssm"]["prior_net"]["heads_0"]
         params["rssm"]["prior_net"]["heads_0"] = jax.tree.map(jnp.zeros_like, prior_out)
-        inference = explain(model, params, state).inference
+        inference = explain(model, params, model_state).inference
         same = (inference.latent.stoch == inference.prior_latent.stoch).all()
         assert same == equal
 
 
 def test_imagination_follows_the_same_recursion_as_observation():
-    model, params, state = make()
-    inference = explain(model, params, state).inference
-    carry, latent = model.starts(params, state, inference)
+    model, params, model_state = make()
+    inference = explain(model, params, model_state).inference
+    carry, latent = model.starts(params, model_state, inference)
     assert latent.deter.shape == (BATCH * LENGTH, CONFIG.deter)
     np.testing.assert_array_equal(latent.deter[LENGTH], inference.latent.deter[1, 0])
     np.testing.assert_array_equal(latent.stoch[LENGTH], inference.latent.stoch[1, 0])
     action = jax.random.normal(jax.random.key(4), (BATCH * LENGTH, 3))
-    _, after = model.imagine(params, state, jax.random.key(5), carry, action)
+    _, after = model.imagine(params, model_state, jax.random.key(5), carry, action)
     np.testing.assert_allclose(after.deter, advanced(params, latent, action), atol=1e-5)
 
 
@@ -181,24 +182,26 @@ def advanced(params, latent, action):
 
 
 def test_following_infers_and_then_predicts_what_the_last_action_leads_to():
-    model, params, state = make()
+    model, params, model_state = make()
     data = batch(start(model), *experience())
-    inferred, (carry, latent) = model.follow(params, state, jax.random.key(2), data, horizon=3)
+    inferred, (carry, latent) = model.follow(
+        params, model_state, jax.random.key(2), data, horizon=3
+    )
     key = jax.random.split(jax.random.key(2))[0]
-    explanation, _ = model.explain(params, state, key, data)
+    explanation, _ = model.explain(params, model_state, key, data)
     jax.tree.map(np.testing.assert_array_equal, inferred, explanation.inference.latent)
     last, action = jax.tree.map(lambda x: x[:, -1], (inferred, data.trajectory.action))
     np.testing.assert_allclose(latent.deter, advanced(params, last, action), atol=1e-5)
-    _, after = model.imagine(params, state, jax.random.key(3), carry, action)
+    _, after = model.imagine(params, model_state, jax.random.key(3), carry, action)
     np.testing.assert_allclose(after.deter, advanced(params, latent, action), atol=1e-5)
 
 
 def test_imagination_starts_carry_no_gradient():
-    model, params, state = make()
+    model, params, model_state = make()
 
     def loss(params):
-        inference = explain(model, params, state).inference
-        _, latent = model.starts(params, state, inference)
+        inference = explain(model, params, model_state).inference
+        _, latent = model.starts(params, model_state, inference)
         return latent.deter.sum() + (latent.stoch**2).sum()
 
     gradient = jax.grad(loss)(params)
@@ -207,9 +210,9 @@ def test_imagination_starts_carry_no_gradient():
 
 def test_a_zero_initialised_reward_head_predicts_the_same_logits_everywhere():
     model = rssm(CONFIG, SPEC)
-    params, state = model.init(jax.random.key(0))
+    params, model_state = model.init(jax.random.key(0))
     latent = start(model)
-    predictions = model.predict(params, state, latent)
+    predictions = model.predict(params, model_state, latent)
     np.testing.assert_array_equal(predictions.reward, 0.0)
     assert predictions.obs.shape == (BATCH, 5)
     assert predictions.cont.shape == (BATCH,)
@@ -217,10 +220,10 @@ def test_a_zero_initialised_reward_head_predicts_the_same_logits_everywhere():
 
 
 def test_jit_equals_eager():
-    model, params, state = make()
+    model, params, model_state = make()
 
     def infer(params):
-        return explain(model, params, state)
+        return explain(model, params, model_state)
 
     eager, jitted = infer(params), jax.jit(infer)(params)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), eager, jitted)
@@ -228,15 +231,15 @@ def test_jit_equals_eager():
 
 def test_bfloat16_products_keep_float32_parameters_and_logits():
     model = rssm(CONFIG, SPEC, dtype=jnp.bfloat16)
-    params, state = model.init(jax.random.key(0))
+    params, model_state = model.init(jax.random.key(0))
     assert all(x.dtype == jnp.float32 for x in jax.tree.leaves(params))
     carry = model.initial(BATCH)
     explanation, _ = model.explain(
-        params, state, jax.random.key(2), batch(carry, *experience())
+        params, model_state, jax.random.key(2), batch(carry, *experience())
     )
-    inference, predictions, _ = explanation
+    inference, predictions = explanation.inference, explanation.predictions
     now = jax.tree.map(lambda x: x[:, 0], experience())
-    carry, _ = model.filter(params, state, jax.random.key(2), carry, *now)
+    carry, _ = model.filter(params, model_state, jax.random.key(2), carry, *now)
     for latent in (carry, inference.latent, inference.prior_latent):
         assert latent.deter.dtype == latent.stoch.dtype == jnp.bfloat16
     assert all(x.dtype == jnp.float32 for x in jax.tree.leaves(predictions))

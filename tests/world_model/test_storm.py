@@ -31,7 +31,7 @@ OFFICIAL = {
 
 def test_parameter_counts_are_the_official_ones():
     agent = make_agent(STORM, EnvSpec("test", image(64), 18, True, 1, 4, None))
-    params, state = jax.eval_shape(agent.init, jax.random.key(0))
+    params, model_state = jax.eval_shape(agent.init, jax.random.key(0))
     model = params.world_model
     actual = {name: parameter_count(model[name]) for name in OFFICIAL if name in model}
     net = model["storm"]
@@ -42,7 +42,7 @@ def test_parameter_counts_are_the_official_ones():
     # The official agent holds the slow critic as well.
     actual["agent"] = parameter_count(params.actor) + 2 * parameter_count(params.critic)
     assert actual == OFFICIAL
-    assert parameter_count(state) == 2 * 960  # running means and variances
+    assert parameter_count(model_state) == 2 * 960  # running means and variances
 
 
 def test_the_quick_preset_is_small():
@@ -80,22 +80,24 @@ def test_the_window_takes_the_waiting_step_and_drops_the_oldest_when_full():
 @functools.cache
 def make(**changes):
     model = storm(tiny_storm.model(**changes), SPEC)
-    params, state = model.init(jax.random.key(0))
+    params, model_state = model.init(jax.random.key(0))
     params = noisy(params)
     out = params["storm"]["posterior_out"]
     params["storm"]["posterior_out"] = out | {"kernel": 100 * out["kernel"]}
-    return model, jax.jit(model.filter), params, state
+    return model, jax.jit(model.filter), params, model_state
 
 
 def act(steps, is_first=None, **changes):
     """Latents along observations `[T, 2 environments]`, under one noise; actions are 0.5."""
-    model, filter_step, params, state = make(**changes)
+    model, filter_step, params, model_state = make(**changes)
     carry, latents = model.initial(2), []
     action = jnp.full((2, 3), 0.5)
     for t, seen in enumerate(steps):
         first = jnp.zeros(2, bool) if is_first is None else jnp.asarray(is_first[t])
         obs = jnp.broadcast_to(jnp.asarray(seen, jnp.float32)[:, None], (2, 2))
-        carry, latent = filter_step(params, state, jax.random.key(1), carry, obs, action, first)
+        carry, latent = filter_step(
+            params, model_state, jax.random.key(1), carry, obs, action, first
+        )
         latents.append(latent)
     return latents
 

@@ -1,4 +1,4 @@
-"""An agent: a world model, an actor and a critic, and how they act."""
+"""An agent: a world model, an actor and a critic, and how it acts."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ LatentLoss = Callable[[PyTree, PyTree, Inference], Array]
 
 
 class Agent(NamedTuple):
-    """Pure functions of parameters; holds no arrays but constants."""
+    """Pure functions of parameters; it holds no arrays except constants."""
 
     spec: EnvSpec
     world_model: WorldModel
@@ -36,11 +36,11 @@ class Agent(NamedTuple):
     latent_loss: LatentLoss | None = None
 
     def init(self, key: Key) -> tuple[Params, PyTree]:
-        """Fresh parameters, and the state of the world model beside them."""
+        """Fresh parameters, and the `model_state` that the world model carries beside them."""
         key_world_model, key_actor, key_critic = jax.random.split(key, 3)
-        world_model, state = self.world_model.init(key_world_model)
+        world_model, model_state = self.world_model.init(key_world_model)
         actor, critic = self.actor.init(key_actor), self.critic.init(key_critic)
-        return Params(world_model, actor, critic), state
+        return Params(world_model, actor, critic), model_state
 
     def initial(self, batch_size: int) -> PolicyCarry:
         """The carry before the first observation."""
@@ -52,31 +52,31 @@ class Agent(NamedTuple):
     def act(
         self,
         params: Params,
-        state: PyTree,
+        model_state: PyTree,
         key: Key,
         carry: PolicyCarry,
         timestep: TimeStep,
         *,
         how: Literal["collect", "sample", "mode"] = "sample",
     ) -> tuple[PolicyCarry, Array]:
-        """Filter `timestep` (`[N, ...]`) and choose an action.
+        """Reads `timestep` (`[N, ...]`) and chooses an action.
 
-        The action is raw: environments clip it. It is zero where an episode has ended,
-        since nothing leaves from a last observation.
+        The action is raw: environments clip it. It is zero where an episode has ended, because
+        no action leaves from a last observation.
 
         Args:
           params: of the agent.
-          state: of its world model.
+          model_state: of its world model.
           key: for latents and actions.
           carry: what the agent remembers.
           timestep: what has arrived.
-          how: sample the policy; sample what collects, at its temperature; or take the
-            policy's mode.
+          how: "sample" from the policy; "collect": sample at `actor.collect_temperature`; or
+            "mode", the most likely action.
         """
         key_filter, key_action = jax.random.split(key)
         memory, latent = self.world_model.filter(
             params.world_model,
-            state,
+            model_state,
             key_filter,
             carry.memory,
             timestep.obs,
@@ -84,13 +84,13 @@ class Agent(NamedTuple):
             timestep.is_first,
         )
         choose = self.actor.behaviour if how == "collect" else self.actor.policy
-        policy = choose(params.actor, latent)
-        action = policy.mode() if how == "mode" else policy.sample(key_action)
+        distribution = choose(params.actor, latent)
+        action = distribution.mode() if how == "mode" else distribution.sample(key_action)
         action = jnp.where(timestep.is_last[:, None], 0.0, action)
         return PolicyCarry(memory, action), action
 
     def random_action(self, key: Key, timestep: TimeStep) -> Array:
-        """Any action, each as likely as another: of all choices, or of all in [-1, 1]."""
+        """A uniformly random action: one of all choices, or numbers in [-1, 1]."""
         shape = (*timestep.is_last.shape, self.spec.action_size)
         if self.spec.discrete:
             chosen = jax.random.randint(key, shape[:-1], 0, shape[-1])
@@ -101,7 +101,7 @@ class Agent(NamedTuple):
 
 
 def resolve_dtype(compute_dtype: str) -> jnp.dtype:
-    """The dtype of products: "auto" is bfloat16 on an accelerator, float32 on CPU."""
+    """The dtype of products: "auto" is bfloat16 on GPU and TPU, float32 on CPU."""
     if compute_dtype == "auto":
         compute_dtype = "float32" if jax.default_backend() == "cpu" else "bfloat16"
     return jnp.dtype(compute_dtype)

@@ -1,4 +1,4 @@
-"""Rollouts of the policy inside the world model."""
+"""Rollouts of the policy in the world model."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ def imagine(
     world_model: WorldModel,
     policy: Callable[[Latent], ActionDistribution],
     params: PyTree,
-    state: PyTree,
+    model_state: PyTree,
     key: Key,
     carry: PyTree,
     start: Latent,
     *,
     horizon: int,
 ) -> Imagined:
-    """Follow `policy` for `horizon` steps from N starts; no gradient leaves here.
+    """Follows `policy` for `horizon` steps from N starts. The result has no gradient.
 
-    Latents are written to their places as they are reached: to put the starts in front of what
-    a scan emits would copy all of them.
+    Each latent is written to its place in one array when it is reached. Concatenating the
+    starts and the outputs of the scan would copy all latents.
 
     Args:
       world_model: the model that imagines.
       policy: pi(a | s), as a function of a latent.
       params: parameters of the world model.
-      state: what it carries beside them.
+      model_state: what the world model carries beside them.
       key: for actions and latents.
-      carry: the world model's imagination state at the starts.
+      carry: what the world model's `imagine` carries at the starts.
       start: `[N, ...]` the latents to start from.
       horizon: H, number of imagined steps.
 
@@ -47,7 +47,7 @@ def imagine(
         (carry, latent, latents), (index, key) = reached, inputs
         key_action, key_latent = jax.random.split(key)
         action = policy(latent).sample(key_action)
-        carry, latent = world_model.imagine(params, state, key_latent, carry, action)
+        carry, latent = world_model.imagine(params, model_state, key_latent, carry, action)
         latents = jax.tree.map(lambda all, x: all.at[index + 1].set(x), latents, latent)
         return (carry, latent, latents), action
 

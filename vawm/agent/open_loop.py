@@ -1,4 +1,4 @@
-"""Open-loop prediction: what the world model expects after it has seen a few steps."""
+"""Open-loop prediction: what the world model predicts after it has seen a few steps."""
 
 from __future__ import annotations
 
@@ -13,21 +13,23 @@ from vawm.types import Array, Batch, Key, Latent, Params, PyTree
 
 
 class OpenLoop(NamedTuple):
-    """Observations as the decoder tells them, `[B, T, ...]`, beside those of the batch."""
+    """Decoded observations, `[B, T, ...]`, one for each of the batch."""
 
     predicted: PyTree  # in the decoder's units: symlog for vectors, [0, 1] for images
-    same_episode: Array  # [B, T] bool, whether no reset lies between the context and here
+    same_episode: Array  # [B, T] bool, whether no reset lies between the context and this step
 
 
 def make_states(agent: Agent, *, context: int) -> Callable[..., tuple[Latent, Latent]]:
-    """Build `states(params, state, key, batch) -> (inferred, imagined)`.
+    """Build `states(params, model_state, key, batch) -> (inferred, imagined)`.
 
     The first `context` of the T steps are observed, `[B, context, ...]`. The others are
     imagined with the batch's own actions; their observations are never read. No gradient.
     """
     world_model = agent.world_model
 
-    def states(params: Params, state: PyTree, key: Key, batch: Batch) -> tuple[Latent, Latent]:
+    def states(
+        params: Params, model_state: PyTree, key: Key, batch: Batch
+    ) -> tuple[Latent, Latent]:
         model = params.world_model
         key_follow, key_imagine = jax.random.split(key)
         steps = batch.trajectory
@@ -35,12 +37,12 @@ def make_states(agent: Agent, *, context: int) -> Callable[..., tuple[Latent, La
         action = steps.action[:, context + 1 : -1].swapaxes(0, 1)
         left = action.shape[0]
         inferred, (carry, first) = world_model.follow(
-            model, state, key_follow, seen, horizon=left
+            model, model_state, key_follow, seen, horizon=left
         )
 
         def imagine(carry: PyTree, inputs: tuple[Array, Key]):
             action, key = inputs
-            return world_model.imagine(model, state, key, carry, action)
+            return world_model.imagine(model, model_state, key, carry, action)
 
         _, latent = jax.lax.scan(imagine, carry, (action, jax.random.split(key_imagine, left)))
         imagined = jax.tree.map(
@@ -52,14 +54,17 @@ def make_states(agent: Agent, *, context: int) -> Callable[..., tuple[Latent, La
 
 
 def make_open_loop(agent: Agent, *, context: int) -> Callable[..., OpenLoop]:
-    """Build `open_loop(params, state, key, batch) -> OpenLoop`: the states, decoded."""
+    """Build `open_loop(params, model_state, key, batch) -> OpenLoop`: the states, decoded."""
     states = make_states(agent, context=context)
 
-    def decode(params: Params, state: PyTree, latent: Latent) -> PyTree:
-        return agent.world_model.predict(params.world_model, state, latent).obs
+    def decode(params: Params, model_state: PyTree, latent: Latent) -> PyTree:
+        return agent.world_model.predict(params.world_model, model_state, latent).obs
 
-    def open_loop(params: Params, state: PyTree, key: Key, batch: Batch) -> OpenLoop:
-        parts = [decode(params, state, part) for part in states(params, state, key, batch)]
+    def open_loop(params: Params, model_state: PyTree, key: Key, batch: Batch) -> OpenLoop:
+        parts = [
+            decode(params, model_state, part)
+            for part in states(params, model_state, key, batch)
+        ]
         resets = jnp.cumsum(batch.trajectory.is_first[:, 1:].astype(jnp.int32), axis=1)
         return OpenLoop(
             predicted=jax.tree.map(lambda a, b: jnp.concatenate([a, b], axis=1), *parts),

@@ -1,7 +1,7 @@
 """Encoders and decoders of observations: one codec for all vectors, one for all images.
 
-`make_codecs` joins the codecs of a world model, so that they read and tell any tree of vectors
-and images. Tokens are those of the vectors, then those of the images.
+`make_codecs` joins both, so that a world model can encode and decode any tree of vectors and
+images. The tokens are those of the vectors, followed by those of the images.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from vawm.types import IMAGE_SIZES, Array, EnvSpec, Key, PyTree, is_image
 class Codec(NamedTuple):
     """Encoder and decoder of one kind of observation, as pure functions.
 
-    The state is what a normalisation carries from update to update; `()` for none.
+    `model_state` are running statistics of a normalisation; `()` for none.
 
     Attributes:
-      init_encoder, init_decoder: `(key) -> (params, state)`.
-      encode: `(params, state, obs, *, train) -> (tokens, state)`, `[..., token_size]`; `obs`
-        are the arrays of this kind, in the order of the tree that an observation is.
-      decode: `(params, state, latent, *, train) -> (predictions, state)` of these arrays;
-        `latent` are the parts of s that the decoder reads.
+      init_encoder, init_decoder: `(key) -> (params, model_state)`.
+      encode: `(params, model_state, obs, *, train) -> (tokens [..., token_size], model_state)`;
+        `obs` are the arrays of this kind, in the order in which they are in an observation.
+      decode: `(params, model_state, feature, *, train) -> (predictions, model_state)` of these
+        arrays; `feature` are the parts of a latent that the decoder reads.
       token_size: width of the tokens.
     """
 
@@ -40,12 +40,12 @@ class Codec(NamedTuple):
 
 
 class Codecs(NamedTuple):
-    """The codecs of an observation, joined; params and states have an entry for each kind.
+    """The joined codecs of an observation; params and model_state have an entry for each kind.
 
     Attributes:
-      init_encoder, init_decoder: `(key) -> (params, state)`.
-      encode: `(params, state, obs, *, train) -> (tokens, state)`; `obs` is the tree.
-      decode: `(params, state, latent, *, train) -> (obs, state)`.
+      init_encoder, init_decoder: `(key) -> (params, model_state)`.
+      encode: `(params, model_state, obs, *, train) -> (tokens, model_state)`, of the tree.
+      decode: `(params, model_state, feature, *, train) -> (obs, model_state)`.
       token_size: width of the tokens of all kinds.
     """
 
@@ -62,16 +62,16 @@ def make_codecs(
     vector: Callable[[list[int]], Codec],
     image: Callable[[int, list[int]], Codec],
 ) -> Codecs:
-    """Codecs for what `spec` says is observed.
+    """Codecs for the observations of `spec`.
 
     Args:
       spec: of the environment.
-      vector: makes the codec of vectors of these widths.
-      image: makes the codec of images of this size and these numbers of channels.
+      vector: makes the codec for vectors of these widths.
+      image: makes the codec for images of this size and these numbers of channels.
 
     Raises:
-      InvalidInput: an observation that is neither a vector nor a square image whose
-        halvings fit.
+      InvalidInput: an observation that is neither a vector nor a square image whose size can be
+        halved four times.
     """
     check_obs(spec.obs)
     leaves, tree = jax.tree.flatten(spec.obs)
@@ -91,8 +91,8 @@ def make_codecs(
 
         return init_all
 
-    def encode(params: PyTree, state: PyTree, obs: PyTree, *, train: bool):
-        # By the spec: pixels may come as floats, which have a gradient.
+    def encode(params: PyTree, model_state: PyTree, obs: PyTree, *, train: bool):
+        # The kind is that of the spec: pixels may also come as floats, to be differentiated.
         pairs = list(zip(leaves, jax.tree.leaves(obs), strict=True))
         kinds = {
             "vector": [x for leaf, x in pairs if not is_image(leaf)],
@@ -101,15 +101,17 @@ def make_codecs(
         tokens, states = {}, {}
         for kind, codec in codecs.items():
             tokens[kind], states[kind] = codec.encode(
-                params[kind], state[kind], kinds[kind], train=train
+                params[kind], model_state[kind], kinds[kind], train=train
             )
         parts = list(tokens.values())
         return parts[0] if len(parts) == 1 else jnp.concatenate(parts, -1), states
 
-    def decode(params: PyTree, state: PyTree, latent: PyTree, *, train: bool):
+    def decode(params: PyTree, model_state: PyTree, feature: PyTree, *, train: bool):
         decoded, states = {}, {}
         for kind, codec in codecs.items():
-            arrays, states[kind] = codec.decode(params[kind], state[kind], latent, train=train)
+            arrays, states[kind] = codec.decode(
+                params[kind], model_state[kind], feature, train=train
+            )
             decoded[kind] = iter(arrays)
         kinds = ["image" if is_image(leaf) else "vector" for leaf in leaves]
         obs = [next(decoded[kind]).astype(jnp.float32) for kind in kinds]
@@ -132,13 +134,13 @@ def vector_codec(
     latent: Sequence[int],
     token_size: int,
 ) -> Codec:
-    """Symlog MLPs: the encoder reads symlog(o), the decoder predicts symlog(o); no state.
+    """Symlog MLPs: the encoder reads symlog(o), the decoder predicts symlog(o); no model_state.
 
     Args:
-      encoder: one without outputs.
-      decoder: one with an output for each vector.
+      encoder: a network without outputs.
+      decoder: a network with one output for each vector.
       widths: of the vectors.
-      latent: widths of what the decoder reads.
+      latent: widths of the arrays that the decoder reads.
       token_size: of the encoder.
     """
 
@@ -149,32 +151,32 @@ def vector_codec(
         inputs = [jnp.zeros((1, width)) for width in latent]
         return decoder.init(key, *inputs)["params"], ()
 
-    def encode(params: PyTree, state: PyTree, obs: list[Array], *, train: bool):
+    def encode(params: PyTree, model_state: PyTree, obs: list[Array], *, train: bool):
         del train
         vector = obs[0] if len(obs) == 1 else jnp.concatenate(obs, -1)
-        return jnp.asarray(encoder.apply({"params": params}, symlog(vector))), state
+        return jnp.asarray(encoder.apply({"params": params}, symlog(vector))), model_state
 
-    def decode(params: PyTree, state: PyTree, latent: tuple[Array, ...], *, train: bool):
+    def decode(params: PyTree, model_state: PyTree, feature: tuple[Array, ...], *, train: bool):
         del train
-        return list(decoder.apply({"params": params}, *latent)), state
+        return list(decoder.apply({"params": params}, *feature)), model_state
 
     return Codec(init_encoder, init_decoder, encode, decode, token_size)
 
 
 def join_pixels(images: list[Array]) -> Array:
-    """Images joined on their channels: `[N, size, size, C]`, leading dims flat."""
+    """Concatenates images on their channels: `[N, size, size, C]`, leading dims flat."""
     pixels = images[0] if len(images) == 1 else jnp.concatenate(images, -1)
     return pixels.reshape(-1, *pixels.shape[-3:])
 
 
 def split_pixels(pixels: Array, channels: list[int]) -> list[Array]:
-    """The inverse of concatenating on the channels."""
+    """Splits images that were concatenated on their channels."""
     ends = [sum(channels[: i + 1]) for i in range(len(channels) - 1)]
     return jnp.split(pixels, ends, -1)
 
 
 def one_each(key: Key, names: Collection[str]) -> dict[str, Key]:
-    """A key for each name; `key` itself where there is one."""
+    """A key for each name; `key` itself if there is only one name."""
     keys = [key] if len(names) == 1 else list(jax.random.split(key, len(names)))
     return dict(zip(names, keys, strict=True))
 
@@ -183,7 +185,7 @@ def check_obs(obs: PyTree) -> None:
     """Refuses observations that the networks cannot read.
 
     Raises:
-      InvalidInput: names the first of them.
+      InvalidInput: names the first one.
     """
     sizes = set()
     for path, leaf in jax.tree_util.tree_leaves_with_path(obs):
@@ -191,22 +193,22 @@ def check_obs(obs: PyTree) -> None:
         shape = tuple(leaf.shape)
         if not is_image(leaf):
             if leaf.dtype != jnp.float32 or len(shape) != 1 or not shape[0]:
-                remedy = "vectors are float32 of one dimension, images are uint8"
+                remedy = "make vectors float32 with one dimension, and images uint8"
                 raise InvalidInput(name, f"{leaf.dtype}{list(shape)}", remedy)
             continue
         if len(shape) != 3 or shape[0] != shape[1]:
-            raise InvalidInput(name, shape, "images are [size, size, channels]")
+            raise InvalidInput(name, shape, "give images the shape [size, size, channels]")
         check_image_size(name, shape[0])
         sizes.add(shape[0])
     if len(sizes) > 1:
-        raise InvalidInput("obs", sorted(sizes), "all images of an observation have one size")
+        raise InvalidInput("obs", sorted(sizes), "give all images of an observation one size")
 
 
 def check_image_size(name: str, size: int) -> None:
-    """Refuses a side of an image that cannot be halved as often as the CNN does.
+    """Refuses images that cannot be halved four times, as the CNNs do.
 
     Raises:
-      InvalidInput: with the sizes that can.
+      InvalidInput: names sizes that can.
     """
     if size not in IMAGE_SIZES:
         low, high, step = IMAGE_SIZES[0], IMAGE_SIZES[-1], IMAGE_SIZES.step

@@ -1,4 +1,4 @@
-"""Encoder, decoder, reward and continue heads of DreamerV3."""
+"""Encoder, decoder, reward and continue heads: `Heads`, and those of DreamerV3."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 
 from vawm import nets
-from vawm.config import RSSMConfig
-from vawm.types import Array, EnvSpec, Key, Latent, PyTree, flat_stoch
+from vawm.config import HeadsConfig
+from vawm.types import Array, EnvSpec, Key, PyTree
 from vawm.world_model import codecs
 from vawm.world_model.codecs import Codec, Codecs, join_pixels, split_pixels
 
@@ -18,95 +18,98 @@ Network = nets.MLP | nets.ReluMLP
 
 
 class Heads(NamedTuple):
-    """Pure functions.
+    """The heads of a world model, as pure functions.
+
+    `model_state` is the part of a world model's state that belongs to the heads: running
+    statistics, if there are any. `feature` are the parts of a latent that a head reads, a tuple
+    of arrays, such as `vawm.types.features(latent)`.
 
     Attributes:
-      init: `(key) -> (params, state)`.
-      encode: `(params, state, obs) -> tokens`.
-      decode: `(params, state, latent) -> obs`.
-      outcome: `(params, latent) -> (reward logits [..., bins], continue logit [...])`.
+      init: `(key) -> (params, model_state)`.
+      encode: `(params, model_state, obs, *, train=False) -> (tokens, model_state)`.
+      decode: `(params, model_state, feature, *, train=False) -> (obs, model_state)`.
+      outcome: `(params, feature) -> (reward logits [..., bins], continue logit [...])`.
       token_size: width of the tokens.
     """
 
     init: Callable[[Key], tuple[PyTree, PyTree]]
-    encode: Callable[[PyTree, PyTree, PyTree], Array]
-    decode: Callable[[PyTree, PyTree, Latent], PyTree]
-    outcome: Callable[[PyTree, Latent], tuple[Array, Array]]
+    encode: Callable[..., tuple[Array, PyTree]]
+    decode: Callable[..., tuple[PyTree, PyTree]]
+    outcome: Callable[[PyTree, tuple[Array, ...]], tuple[Array, Array]]
     token_size: int
 
 
-def make_heads(config: RSSMConfig, spec: EnvSpec, dtype: jnp.dtype) -> Heads:
-    """Heads for any mixture of vectors and images.
+def join_heads(codec: Codecs, reward: Network, cont: Network) -> Heads:
+    """The heads that a codec and two networks make, under four keys of parameters.
 
-    The reward head has `bins` logits with zero initial output, the continue head one logit.
-    The state of the codecs holds no array: nothing here is carried from update to update.
+    Args:
+      codec: encoder and decoder.
+      reward: its first output are the logits of the reward's two-hot code.
+      cont: its first output is the logit of continuation, of width 1.
+    """
+
+    def init(key: Key) -> tuple[PyTree, PyTree]:
+        key_encoder, key_decoder, key_reward, key_cont = jax.random.split(key, 4)
+        encoder, encoder_state = codec.init_encoder(key_encoder)
+        decoder, decoder_state = codec.init_decoder(key_decoder)
+        params = {
+            "encoder": encoder,
+            "decoder": decoder,
+            "reward": init_network(reward, key_reward),
+            "cont": init_network(cont, key_cont),
+        }
+        return params, {"encoder": encoder_state, "decoder": decoder_state}
+
+    def encode(params: PyTree, model_state: PyTree, obs: PyTree, *, train: bool = False):
+        tokens, own = codec.encode(params["encoder"], model_state["encoder"], obs, train=train)
+        return tokens, model_state | {"encoder": own}
+
+    def decode(
+        params: PyTree, model_state: PyTree, feature: tuple[Array, ...], *, train: bool = False
+    ):
+        obs, own = codec.decode(params["decoder"], model_state["decoder"], feature, train=train)
+        return obs, model_state | {"decoder": own}
+
+    def outcome(params: PyTree, feature: tuple[Array, ...]) -> tuple[Array, Array]:
+        logits = reward.apply({"params": params["reward"]}, *feature)[0]
+        logit = cont.apply({"params": params["cont"]}, *feature)[0]
+        return logits.astype(jnp.float32), logit[..., 0].astype(jnp.float32)
+
+    return Heads(init, encode, decode, outcome, codec.token_size)
+
+
+def init_network(network: Network, key: Key) -> PyTree:
+    """Fresh parameters."""
+    return network.init(key, jnp.zeros((1, network.in_features)))["params"]
+
+
+def make_heads(config: HeadsConfig, spec: EnvSpec, dtype: jnp.dtype) -> Heads:
+    """The heads of DreamerV3, for any mixture of vectors and images.
+
+    Decoder, reward head and continue head read [h, z]. The reward head has `bins` logits, which
+    start at 0; the continue head has one. There are no running statistics, so `model_state`
+    has no arrays, and `train` changes nothing.
 
     Raises:
-      InvalidInput: an observation that is neither a vector nor a square image whose
-        halvings fit.
+      InvalidInput: an observation that is neither a vector nor a square image whose size can be
+        halved four times.
     """
     codec = codecs.make_codecs(
         spec,
         vector=lambda widths: vector_codec(config, widths, dtype),
         image=lambda size, channels: image_codec(config, size, channels, dtype),
     )
-    features = config.deter + config.stoch * config.classes
-
-    def mlp(layers, outputs, scale):
-        return nets.MLP(features, layers, config.units, (outputs,), (scale,), dtype)
-
-    reward = mlp(config.reward_layers, config.bins, 0.0)
-    cont = mlp(config.continue_layers, 1, 1.0)
-
-    read = make_outcome(reward, cont)
-
-    def init(key: Key) -> tuple[PyTree, PyTree]:
-        return init_heads(key, codec, reward, cont, jnp.zeros((1, features)))
-
-    def encode(params: PyTree, state: PyTree, obs: PyTree) -> Array:
-        return codec.encode(params["encoder"], state["encoder"], obs, train=False)[0]
-
-    def decode(params: PyTree, state: PyTree, latent: Latent) -> PyTree:
-        feature = latent.deter, flat_stoch(latent.stoch)
-        return codec.decode(params["decoder"], state["decoder"], feature, train=False)[0]
-
-    def outcome(params: PyTree, latent: Latent) -> tuple[Array, Array]:
-        return read(params, latent.deter, flat_stoch(latent.stoch))
-
-    return Heads(init, encode, decode, outcome, codec.token_size)
+    width = config.deter + config.stoch * config.classes
+    return join_heads(
+        codec,
+        reward=nets.MLP(
+            width, config.reward_layers, config.units, (config.bins,), (0.0,), dtype
+        ),
+        cont=nets.MLP(width, config.continue_layers, config.units, (1,), (1.0,), dtype),
+    )
 
 
-def init_heads(
-    key: Key, codec: Codecs, reward: Network, cont: Network, feature: Array
-) -> tuple[PyTree, PyTree]:
-    """Parameters and state of all heads; `feature` is what reward and continuation read."""
-    key_encoder, key_decoder, key_reward, key_cont = jax.random.split(key, 4)
-    encoder, encoder_state = codec.init_encoder(key_encoder)
-    decoder, decoder_state = codec.init_decoder(key_decoder)
-    params = {
-        "encoder": encoder,
-        "decoder": decoder,
-        "reward": reward.init(key_reward, feature)["params"],
-        "cont": cont.init(key_cont, feature)["params"],
-    }
-    return params, {"encoder": encoder_state, "decoder": decoder_state}
-
-
-def make_outcome(reward: Network, cont: Network) -> Callable[..., tuple[Array, Array]]:
-    """Build `outcome(params, *feature) -> (logits, logit)` of reward and continuation.
-
-    `[..., bins]` and `[...]`, both float32.
-    """
-
-    def outcome(params: PyTree, *feature: Array) -> tuple[Array, Array]:
-        logits = reward.apply({"params": params["reward"]}, *feature)[0]
-        logit = cont.apply({"params": params["cont"]}, *feature)[0]
-        return logits.astype(jnp.float32), logit[..., 0].astype(jnp.float32)
-
-    return outcome
-
-
-def vector_codec(config: RSSMConfig, widths: list[int], dtype: jnp.dtype) -> Codec:
+def vector_codec(config: HeadsConfig, widths: list[int], dtype: jnp.dtype) -> Codec:
     """MLPs: the decoder reads h and z."""
     latent, units = (config.deter, config.stoch * config.classes), config.units
     scales = (1.0,) * len(widths)
@@ -119,7 +122,7 @@ def vector_codec(config: RSSMConfig, widths: list[int], dtype: jnp.dtype) -> Cod
     )
 
 
-def image_codec(config: RSSMConfig, size: int, channels: list[int], dtype: jnp.dtype) -> Codec:
+def image_codec(config: HeadsConfig, size: int, channels: list[int], dtype: jnp.dtype) -> Codec:
     """CNNs: the encoder reads o / 255 - 0.5, the decoder predicts o / 255.
 
     Images are concatenated on their channels.
@@ -145,22 +148,24 @@ def image_codec(config: RSSMConfig, size: int, channels: list[int], dtype: jnp.d
         latent = jnp.zeros((1, config.deter), dtype), jnp.zeros((1, flat), dtype)
         return decoder.init(key, *latent)["params"], ()
 
-    def encode(params: PyTree, state: PyTree, obs: list[Array], *, train: bool):
+    def encode(params: PyTree, model_state: PyTree, obs: list[Array], *, train: bool):
         del train
         pixels = join_pixels(obs).astype(dtype) / 255.0 - 0.5
         tokens = jnp.asarray(encoder.apply({"params": params}, pixels))
-        return tokens.reshape(*obs[0].shape[:-3], -1), state
+        return tokens.reshape(*obs[0].shape[:-3], -1), model_state
 
-    def decode(params: PyTree, state: PyTree, latent: tuple[Array, Array], *, train: bool):
+    def decode(
+        params: PyTree, model_state: PyTree, feature: tuple[Array, Array], *, train: bool
+    ):
         del train
-        deter, stoch = latent
+        deter, stoch = feature
         pixels = jnp.asarray(
             decoder.apply(
                 {"params": params}, deter.reshape(-1, config.deter), stoch.reshape(-1, flat)
             )
         )
         pixels = pixels.reshape(*deter.shape[:-1], *pixels.shape[1:])
-        return split_pixels(pixels, channels), state
+        return split_pixels(pixels, channels), model_state
 
     side = size // 2**nets.HALVINGS
     tokens = side * side * nets.STAGE_WIDTHS[-1] * config.depth

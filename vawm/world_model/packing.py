@@ -1,4 +1,4 @@
-"""How latents lie in replay: classes of one-hot z as bytes."""
+"""How replay stores latents: the classes of a one-hot z as bytes."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from vawm.types import Latent
 
 
 def pack(latent: Latent) -> Latent:
-    """One-hot classes `[..., S, K]` as their indices `[..., S]`: exact, a byte for K floats."""
+    """Replaces one-hot z `[..., S, K]` by indices `[..., S]`: exact, one byte for K floats."""
     return latent._replace(stoch=jnp.argmax(latent.stoch, -1).astype(jnp.uint8))
 
 
 def unpack(latent: Latent, classes: int) -> Latent:
-    """Inverse of `pack`, in the dtype of h."""
+    """The inverse of `pack`; z has the dtype of h."""
     return latent._replace(
         stoch=jax.nn.one_hot(latent.stoch, classes, dtype=latent.deter.dtype)
     )

@@ -21,6 +21,7 @@ from vawm.types import (
     Predictions,
     PyTree,
     Targets,
+    features,
     flat_stoch,
 )
 from vawm.world_model.heads import make_heads
@@ -29,7 +30,7 @@ from vawm.world_model.protocol import Imagination, WorldModel
 
 
 def network(config: RSSMConfig, *, actions: int, tokens: int, dtype: jnp.dtype) -> nets.RSSM:
-    """The layers, for actions and tokens of these widths."""
+    """The layers for actions and tokens of these widths."""
     return nets.RSSM(
         deter=config.deter,
         hidden=config.hidden,
@@ -51,6 +52,11 @@ def blank(config: RSSMConfig, batch_size: int, *, dtype: jnp.dtype) -> Latent:
     )
 
 
+def swap_time(tree: PyTree) -> PyTree:
+    """`[B, T, ...]` -> `[T, B, ...]`, and back."""
+    return jax.tree.map(lambda x: x.swapaxes(0, 1), tree)
+
+
 def rssm(
     config: RSSMConfig,
     spec: EnvSpec,
@@ -63,20 +69,19 @@ def rssm(
 
         h_t = f(h_{t-1}, z_{t-1}, a_{t-1}),  z_t ~ q(z | h_t, o_t),  z~_t ~ p(z | h_t)
 
-    Or, deterministic, with the probabilities of q and p in the place of samples. It remembers
-    the `Latent` s_{t-1}, which replay keeps beside every step. What needs no
-    recurrence (the encoder, what the action and the observation add to their layers, the
-    prior) is computed for all time steps at once; the scan holds only the rest. Nothing is
-    carried from update to update (the state has no arrays), and nothing differs between
-    training and acting.
+    If deterministic, z and z~ are the probabilities of q and p instead of samples. The model
+    remembers the `Latent` s_{t-1}, which replay keeps beside every step. Everything that needs
+    no recurrence (the encoder, the share of the action and of the observation in their layers,
+    the prior) is computed for all time steps at once; only the rest is in the scan.
+    `model_state` has no arrays, and training and acting are the same.
 
     Args:
       config: widths and layers.
       spec: shapes of observation and action.
       dtype: of products; parameters, logits and norms stay float32.
-      noise: whether z~ is sampled with its own noise or with the noise of z ("shared":
-        equal distributions then give equal samples).
-      deterministic: whether z and z~ are probabilities, and no key matters.
+      noise: "independent": z~ has random numbers of its own; "shared": those of z, so that
+        equal distributions give equal samples.
+      deterministic: whether z and z~ are probabilities. Then keys do not matter.
     """
     heads = make_heads(config, spec, dtype)
     net = network(config, actions=spec.action_size, tokens=heads.token_size, dtype=dtype)
@@ -99,27 +104,26 @@ def rssm(
         key_rssm, key_heads = jax.random.split(key)
         widths = config.deter, config.stoch * config.classes, spec.action_size, heads.token_size
         params = net.init(key_rssm, *(jnp.zeros((1, width), dtype) for width in widths))
-        head_params, state = heads.init(key_heads)
-        return {"rssm": params["params"], **head_params}, state
+        head_params, model_state = heads.init(key_heads)
+        return {"rssm": params["params"], **head_params}, model_state
 
     def observe(
         params: PyTree,
-        state: PyTree,
+        model_state: PyTree,
         key: Key,
         carry: Latent,
         obs: PyTree,
         prev_action: Array,
         is_first: Array,
     ) -> Inference:
-        """Filters `[B, T, ...]` from s_0 on; `prev_action[:, t]` is a_{t-1}."""
+        """Infers `[B, T, ...]` after the latent `carry`; `prev_action[:, t]` is a_{t-1}."""
         key_post, key_prior = jax.random.split(key)
         batch, length = is_first.shape
-        obs, prev_action, is_first = jax.tree.map(
-            lambda x: x.swapaxes(0, 1), (obs, prev_action, is_first)
-        )
+        obs, prev_action, is_first = swap_time((obs, prev_action, is_first))
         keep = 1.0 - is_first.astype(dtype)[..., None]
         drive = apply(params, lambda m, a: m.gru.drive(a), prev_action.astype(dtype) * keep)
-        tokens = apply(params, nets.RSSM.read_tokens, heads.encode(params, state, obs))
+        tokens, _ = heads.encode(params, model_state, obs)
+        tokens = apply(params, nets.RSSM.read_tokens, tokens)
         uniform = jax.random.uniform(key_post, (length, batch, config.stoch))
 
         def step(latent: Latent, inputs):
@@ -136,19 +140,18 @@ def rssm(
         if noise == "independent":
             uniform = jax.random.uniform(key_prior, uniform.shape)
         prior_latent = Latent(latent.deter, sample(prior_logits, uniform))
-        inference = Inference(latent, prior_latent, post_logits, prior_logits)
-        return jax.tree.map(lambda x: x.swapaxes(0, 1), inference)
+        return swap_time(Inference(latent, prior_latent, post_logits, prior_logits))
 
-    def observe_batch(params: PyTree, state: PyTree, key: Key, batch: Batch) -> Inference:
+    def observe_batch(params: PyTree, model_state: PyTree, key: Key, batch: Batch) -> Inference:
         steps = batch.trajectory
         obs, is_first = jax.tree.map(lambda x: x[:, 1:], (steps.obs, steps.is_first))
         prev_action = steps.action[:, :-1]
         context = recall(batch.context)
-        return observe(params, state, key, context, obs, prev_action, is_first)
+        return observe(params, model_state, key, context, obs, prev_action, is_first)
 
     def filter_step(
         params: PyTree,
-        state: PyTree,
+        model_state: PyTree,
         key: Key,
         carry: Latent,
         obs: PyTree,
@@ -156,51 +159,54 @@ def rssm(
         is_first: Array,
     ) -> tuple[Latent, Latent]:
         one_step = jax.tree.map(lambda x: x[:, None], (obs, prev_action, is_first))
-        inference = observe(params, state, key, carry, *one_step)
+        inference = observe(params, model_state, key, carry, *one_step)
         latent = jax.tree.map(lambda x: x[:, 0], inference.latent)
         return latent, latent
 
     def explain(
-        params: PyTree, state: PyTree, key: Key, batch: Batch
+        params: PyTree, model_state: PyTree, key: Key, batch: Batch
     ) -> tuple[Explanation, PyTree]:
-        """Everything at steps 1..T."""
-        inference = observe_batch(params, state, key, batch)
+        """All at steps 1..T."""
+        inference = observe_batch(params, model_state, key, batch)
         steps = jax.tree.map(lambda x: x[:, 1:], batch.trajectory)
         shown = inference.latent
         if not config.reconstruction_gradient:
             shown = jax.lax.stop_gradient(shown)
-        predictions = Predictions(
-            heads.decode(params, state, shown), *heads.outcome(params, inference.latent)
-        )
+        obs, _ = heads.decode(params, model_state, features(shown))
+        outcome = heads.outcome(params, features(inference.latent))
         targets = Targets(steps.obs, steps.reward, steps.is_terminal)
-        return Explanation(inference, predictions, targets), state
+        return Explanation(inference, Predictions(obs, *outcome), targets), model_state
 
     def begin(params: PyTree, latent: Latent) -> Imagination:
         latent = jax.lax.stop_gradient(latent)
         blocks = apply(params, lambda m, h: m.gru.to_blocks(h), latent.deter)
         return (blocks, latent), latent
 
-    def starts(params: PyTree, state: PyTree, inference: Inference) -> Imagination:
-        """Every posterior state of the batch, terminal ones included."""
-        del state
+    def starts(params: PyTree, model_state: PyTree, inference: Inference) -> Imagination:
+        """From every inferred state of the batch, terminal ones included."""
+        del model_state
         flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), inference.latent)
         return begin(params, flat)
 
     def follow(
-        params: PyTree, state: PyTree, key: Key, batch: Batch, *, horizon: int
+        params: PyTree, model_state: PyTree, key: Key, batch: Batch, *, horizon: int
     ) -> tuple[Latent, Imagination]:
         del horizon
         key_observe, key_imagine = jax.random.split(key)
-        latent = observe_batch(params, state, key_observe, batch).latent
+        latent = observe_batch(params, model_state, key_observe, batch).latent
         carry, _ = begin(params, jax.tree.map(lambda x: x[:, -1], latent))
         return latent, imagine(
-            params, state, key_imagine, carry, batch.trajectory.action[:, -1]
+            params, model_state, key_imagine, carry, batch.trajectory.action[:, -1]
         )
 
     def imagine(
-        params: PyTree, state: PyTree, key: Key, carry: tuple[Array, Latent], action: Array
+        params: PyTree,
+        model_state: PyTree,
+        key: Key,
+        carry: tuple[Array, Latent],
+        action: Array,
     ) -> Imagination:
-        del state
+        del model_state
         blocks, latent = carry
         drive = apply(params, lambda m, a: m.gru.drive(a), action.astype(dtype))
         blocks, deter, logits = apply(
@@ -210,9 +216,10 @@ def rssm(
         latent = Latent(deter, sample(logits, uniform))
         return (blocks, latent), latent
 
-    def predict(params: PyTree, state: PyTree, latent: Latent) -> Predictions:
-        obs = heads.decode(params, state, latent)
-        return Predictions(obs, *heads.outcome(params, latent))
+    def predict(params: PyTree, model_state: PyTree, latent: Latent) -> Predictions:
+        feature = features(latent)
+        obs, _ = heads.decode(params, model_state, feature)
+        return Predictions(obs, *heads.outcome(params, feature))
 
     return WorldModel(
         init=init,

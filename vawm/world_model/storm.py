@@ -40,26 +40,27 @@ def storm(
 
         z_t ~ q(z | o_t),  e_t = mix(z_t, a_t),  h_{t+1} = f(e_1 .. e_t),  z~_t ~ p(z | h_t)
 
-    By our index h_{t+1} belongs to what arrives at t + 1: the reward, the end of the episode
+    In our index h_{t+1} belongs to what arrives at t + 1: the reward, the end of the episode
     and the prediction of z_{t+1} are read from it. The official code calls it h_t, and its
-    agent's state [z_t, h_{t-1}] is our s_t = (h_t, z_t). Reward and continuation read h alone,
+    agent's state [z_t, h_{t-1}] is our s_t = (h_t, z_t). Reward and continue head read h alone,
     the decoder z alone, the posterior o_t alone.
 
-    Training sees T + 1 steps: the first T observations are inferred and reconstructed, the T
-    last rewards are predicted, and the T - 1 states between are both inferred and predicted.
-    Attention, predictions and divergences cross the ends of episodes, as in the official code,
-    unless `clear_context`: then nothing before a first step is attended to, and h is 0 there.
+    Training uses T + 1 steps: the first T observations are inferred and reconstructed, the last
+    T rewards are predicted, and the T - 1 states between are both inferred and predicted.
+    Attention, predictions and the KL cross the ends of episodes, as in the official code. With
+    `clear_context` they do not: no step attends to an earlier episode, and h is 0 at a first
+    step.
 
-    Acting reads a window of the last `act_context` steps anew at every step. The policy's state
-    has z~_t, the prediction made before o_t is seen, or with `act_latent="posterior"` z_t;
-    before anything was seen h is 0. The official code takes a random action instead then, and
-    fills its window only once the random steps of the beginning are over.
+    Acting reads the last `act_context` steps again at every step. The policy's latent has z~_t,
+    the prediction made before o_t is seen, or z_t with `act_latent="posterior"`. Before
+    anything was seen, h is 0. There the official code takes a random action instead, and it
+    fills its window only after the random steps at the start.
 
     Args:
       config: widths, layers, and choices of the official code.
       spec: shapes of observation and action.
       dtype: of products; parameters, logits and norms stay float32.
-      noise: whether z~ is sampled with its own noise or with the noise of z.
+      noise: "independent": z~ has random numbers of its own; "shared": those of z.
     """
     heads = make_storm_heads(config, spec, dtype)
     net = nets.Storm(
@@ -86,11 +87,11 @@ def storm(
         key_net, key_heads = jax.random.split(key)
         widths = heads.token_size, spec.action_size
         params = net.init(key_net, *(jnp.zeros((1, 1, width)) for width in widths))
-        head_params, state = heads.init(key_heads)
-        return {"storm": params["params"], **head_params}, state
+        head_params, model_state = heads.init(key_heads)
+        return {"storm": params["params"], **head_params}, model_state
 
     def visibility(is_first: Array) -> Array:
-        """`[B or 1, L, L]`: which step sees which."""
+        """`[B or 1, L, L]`: whether a step may attend to another."""
         past = nets.causal(is_first.shape[1])
         if not config.clear_context:
             return past
@@ -98,29 +99,29 @@ def storm(
         return past & (episode[:, :, None] == episode[:, None, :])
 
     def clear(deter: Array, is_first: Array) -> Array:
-        """h, or 0 where an episode begins and the one before is to be forgotten."""
+        """h; with `clear_context` 0 where an episode begins."""
         if not config.clear_context:
             return deter
         return deter * (1.0 - is_first.astype(deter.dtype)[..., None])
 
     def infer(
-        params: PyTree, state: PyTree, key: Key, obs: PyTree, *, train: bool
+        params: PyTree, model_state: PyTree, key: Key, obs: PyTree, *, train: bool
     ) -> tuple[Array, Array, Array, PyTree]:
-        """Of every observation alone: logits, z, the numbers that drew it, and the state."""
-        tokens, state = heads.encode(params, state, obs, train=train)
+        """For each observation alone: logits, z and its random numbers; the new model_state."""
+        tokens, model_state = heads.encode(params, model_state, obs, train=train)
         logits = apply(params, nets.Storm.posterior, tokens)
         uniform = jax.random.uniform(key, logits.shape[:-1])
-        return logits, sample(logits, uniform), uniform, state
+        return logits, sample(logits, uniform), uniform, model_state
 
     def explain(
-        params: PyTree, state: PyTree, key: Key, batch: Batch
+        params: PyTree, model_state: PyTree, key: Key, batch: Batch
     ) -> tuple[Explanation, PyTree]:
         key_post, key_prior, key_dropout = jax.random.split(key, 3)
         steps = batch.trajectory
         taken = jax.tree.map(lambda x: x[:, :-1], steps)
         arrived = jax.tree.map(lambda x: x[:, 1:], steps)
-        post_logits, stoch, uniform, state = infer(
-            params, state, key_post, taken.obs, train=True
+        post_logits, stoch, uniform, model_state = infer(
+            params, model_state, key_post, taken.obs, train=True
         )
         z = flat_stoch(stoch)
         deter = apply(
@@ -142,31 +143,31 @@ def storm(
             post_logits=post_logits[:, 1:],
             prior_logits=prior_logits[:, :-1],
         )
-        obs, state = heads.decode(params, state, z, train=True)
-        predictions = Predictions(obs, *heads.outcome(params, deter))
+        obs, model_state = heads.decode(params, model_state, (z,), train=True)
+        predictions = Predictions(obs, *heads.outcome(params, (deter,)))
         targets = Targets(taken.obs, arrived.reward, arrived.is_terminal)
-        return Explanation(inference, predictions, targets), state
+        return Explanation(inference, predictions, targets), model_state
 
     def read(
         params: PyTree, stoch: Array, action: Array, visible: Array, asked: slice = slice(None)
     ):
-        """h after the steps `asked`, and keys and values of all, without dropout."""
+        """h after the steps `asked`, and the keys and values of all steps; no dropout."""
         return apply(params, nets.Storm.read, flat_stoch(stoch), action, visible, asked)
 
     def expect(params: PyTree, key: Key, deter: Array) -> Latent:
-        """`[N, D]` -> what the prior expects there."""
+        """The latent with a sample of the prior at h, `[N, D]`."""
         logits = apply(params, nets.Storm.prior, deter)
         return Latent(deter, sample(logits, jax.random.uniform(key, logits.shape[:-1])))
 
     def follow(
-        params: PyTree, state: PyTree, key: Key, batch: Batch, *, horizon: int
+        params: PyTree, model_state: PyTree, key: Key, batch: Batch, *, horizon: int
     ) -> tuple[Latent, Imagination]:
         key_post, key_prior = jax.random.split(key)
         steps = batch.trajectory
-        _, stoch, _, _ = infer(params, state, key_post, steps.obs, train=False)
+        _, stoch, _, _ = infer(params, model_state, key_post, steps.obs, train=False)
         visible = visibility(steps.is_first)
-        # Imagination needs the newest h alone: where nothing else is used, this is computed
-        # without the others, and all that both have in common once.
+        # Imagination needs only the newest h. Callers that use nothing else do not compute the
+        # other h; what both calls have in common is computed once.
         deter, _, _ = read(params, stoch, steps.action, visible)
         newest, keys, values = read(params, stoch, steps.action, visible, slice(-1, None))
         inferred = Latent(clear(deter[:, :-1], steps.is_first[:, 1:]), stoch[:, 1:])
@@ -179,9 +180,13 @@ def storm(
         return inferred, ((cache, latent), latent)
 
     def imagine(
-        params: PyTree, state: PyTree, key: Key, carry: tuple[Cache, Latent], action: Array
+        params: PyTree,
+        model_state: PyTree,
+        key: Key,
+        carry: tuple[Cache, Latent],
+        action: Array,
     ) -> Imagination:
-        del state
+        del model_state
         cache, latent = carry
         deter, cache = apply(params, nets.Storm.step, flat_stoch(latent.stoch), action, cache)
         latent = expect(params, key, deter)
@@ -189,7 +194,7 @@ def storm(
 
     def filter_step(
         params: PyTree,
-        state: PyTree,
+        model_state: PyTree,
         key: Key,
         carry: Window,
         obs: PyTree,
@@ -200,7 +205,7 @@ def storm(
         window = remember(carry, prev_action)
         if config.clear_context:
             window = window._replace(length=jnp.where(is_first, 0, window.length))
-        _, stoch, _, _ = infer(params, state, key_post, window.obs, train=False)
+        _, stoch, _, _ = infer(params, model_state, key_post, window.obs, train=False)
         deter, _, _ = read(params, stoch, window.action, nets.causal(config.act_context))
         newest = jnp.maximum(window.length - 1, 0)[:, None, None]
         deter = jnp.take_along_axis(deter, newest, axis=1)[:, 0]
@@ -208,13 +213,13 @@ def storm(
         if config.act_latent == "prior":
             latent = expect(params, key_z, deter)
         else:
-            _, stoch, _, _ = infer(params, state, key_z, obs, train=False)
+            _, stoch, _, _ = infer(params, model_state, key_z, obs, train=False)
             latent = Latent(deter, stoch)
         return window._replace(latest=obs, waits=jnp.ones_like(window.waits)), latent
 
-    def predict(params: PyTree, state: PyTree, latent: Latent) -> Predictions:
-        obs, _ = heads.decode(params, state, flat_stoch(latent.stoch), train=False)
-        return Predictions(obs, *heads.outcome(params, latent.deter))
+    def predict(params: PyTree, model_state: PyTree, latent: Latent) -> Predictions:
+        obs, _ = heads.decode(params, model_state, (flat_stoch(latent.stoch),))
+        return Predictions(obs, *heads.outcome(params, (latent.deter,)))
 
     return WorldModel(
         init=init,

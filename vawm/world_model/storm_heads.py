@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 
@@ -13,36 +10,19 @@ from vawm.config import StormConfig
 from vawm.types import Array, EnvSpec, Key, PyTree
 from vawm.world_model import codecs
 from vawm.world_model.codecs import Codec, join_pixels, split_pixels
-from vawm.world_model.heads import init_heads, make_outcome
+from vawm.world_model.heads import Heads, join_heads
 
 
-class StormHeads(NamedTuple):
-    """Pure functions. The state is the running statistics of the images' BatchNorm.
+def make_storm_heads(config: StormConfig, spec: EnvSpec, dtype: jnp.dtype) -> Heads:
+    """The heads of STORM, for any mixture of vectors and images.
 
-    Attributes:
-      init: `(key) -> (params, state)`.
-      encode: `(params, state, obs, *, train) -> (tokens, state)`.
-      decode: `(params, state, stoch, *, train) -> (obs, state)`, from flat z alone.
-      outcome: `(params, deter) -> (reward logits [..., bins], continue logit [...])`, from h
-        alone.
-      token_size: width of the tokens.
-    """
-
-    init: Callable[[Key], tuple[PyTree, PyTree]]
-    encode: Callable[..., tuple[Array, PyTree]]
-    decode: Callable[..., tuple[PyTree, PyTree]]
-    outcome: Callable[[PyTree, Array], tuple[Array, Array]]
-    token_size: int
-
-
-def make_storm_heads(config: StormConfig, spec: EnvSpec, dtype: jnp.dtype) -> StormHeads:
-    """Heads for any mixture of vectors and images.
-
-    The official termination head is the continue head with its sign turned.
+    The decoder reads z alone, reward head and continue head read h alone. The official
+    termination head is our continue head with the opposite sign. `model_state` holds the
+    running statistics of the BatchNorm of images.
 
     Raises:
-      InvalidInput: an observation that is neither a vector nor a square image whose
-        halvings fit.
+      InvalidInput: an observation that is neither a vector nor a square image whose size can be
+        halved four times.
     """
     codec = codecs.make_codecs(
         spec,
@@ -53,24 +33,11 @@ def make_storm_heads(config: StormConfig, spec: EnvSpec, dtype: jnp.dtype) -> St
     def mlp(outputs: int) -> nets.ReluMLP:
         return nets.ReluMLP(config.deter, config.head_layers, config.units, (outputs,), dtype)
 
-    reward, cont = mlp(config.bins), mlp(1)
-
-    def init(key: Key) -> tuple[PyTree, PyTree]:
-        return init_heads(key, codec, reward, cont, jnp.zeros((1, config.deter)))
-
-    def encode(params: PyTree, state: PyTree, obs: PyTree, *, train: bool):
-        tokens, own = codec.encode(params["encoder"], state["encoder"], obs, train=train)
-        return tokens, state | {"encoder": own}
-
-    def decode(params: PyTree, state: PyTree, stoch: Array, *, train: bool):
-        obs, own = codec.decode(params["decoder"], state["decoder"], (stoch,), train=train)
-        return obs, state | {"decoder": own}
-
-    return StormHeads(init, encode, decode, make_outcome(reward, cont), codec.token_size)
+    return join_heads(codec, reward=mlp(config.bins), cont=mlp(1))
 
 
 def vector_codec(config: StormConfig, widths: list[int], dtype: jnp.dtype) -> Codec:
-    """MLPs, which the paper has not; their norm is LayerNorm, so there are no statistics."""
+    """MLPs, which the paper does not have. They use LayerNorm: there are no statistics."""
     flat, layers, units = config.stoch * config.classes, config.vector_layers, config.units
     return codecs.vector_codec(
         nets.ReluMLP(sum(widths), layers, units, dtype=dtype),
@@ -82,10 +49,10 @@ def vector_codec(config: StormConfig, widths: list[int], dtype: jnp.dtype) -> Co
 
 
 def image_codec(config: StormConfig, size: int, channels: list[int], dtype: jnp.dtype) -> Codec:
-    """CNNs with BatchNorm: the encoder reads o / 255, the decoder predicts it, unbounded.
+    """CNNs with BatchNorm: the encoder reads o / 255, the decoder predicts it without bounds.
 
-    Training normalises by the statistics of the batch, whatever its leading dims, and moves
-    the running ones; all else uses those.
+    Training normalises with the statistics of the batch, over all its leading dims, and moves
+    the running statistics. Everything else uses the running statistics.
     """
     flat, pixels_shape = config.stoch * config.classes, (1, size, size, sum(channels))
     encoder = nets.StridedEncoder(sum(channels), config.depth, dtype)
@@ -95,22 +62,24 @@ def image_codec(config: StormConfig, size: int, channels: list[int], dtype: jnp.
         variables = module.init(key, jnp.zeros(shape, dtype), train=False)
         return variables["params"], variables["statistics"]
 
-    def apply(module, params: PyTree, state: PyTree, x: Array, train: bool):
-        variables = {"params": params, "statistics": state}
+    def apply(module, params: PyTree, model_state: PyTree, x: Array, train: bool):
+        variables = {"params": params, "statistics": model_state}
         if not train:
-            return module.apply(variables, x, train=False), state
+            return module.apply(variables, x, train=False), model_state
         y, changed = module.apply(variables, x, train=True, mutable=["statistics"])
         return y, jax.lax.stop_gradient(changed["statistics"])
 
-    def encode(params: PyTree, state: PyTree, obs: list[Array], *, train: bool):
-        tokens, state = apply(encoder, params, state, join_pixels(obs), train)
-        return tokens.reshape(*obs[0].shape[:-3], -1), state
+    def encode(params: PyTree, model_state: PyTree, obs: list[Array], *, train: bool):
+        tokens, model_state = apply(encoder, params, model_state, join_pixels(obs), train)
+        return tokens.reshape(*obs[0].shape[:-3], -1), model_state
 
-    def decode(params: PyTree, state: PyTree, latent: tuple[Array], *, train: bool):
-        (stoch,) = latent
-        pixels, state = apply(decoder, params, state, stoch.reshape(-1, flat), train)
+    def decode(params: PyTree, model_state: PyTree, feature: tuple[Array], *, train: bool):
+        (stoch,) = feature
+        pixels, model_state = apply(
+            decoder, params, model_state, stoch.reshape(-1, flat), train
+        )
         pixels = pixels.reshape(*stoch.shape[:-1], *pixels.shape[1:])
-        return split_pixels(pixels, channels), state
+        return split_pixels(pixels, channels), model_state
 
     side = size // 2**nets.HALVINGS
     tokens = side * side * nets.STRIDED_WIDTHS[-1] * config.depth

@@ -1,4 +1,4 @@
-"""A window over the last steps: what an agent without a recurrent state remembers."""
+"""The last steps, which an agent without a recurrent state remembers."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from vawm.types import Array, EnvSpec, PyTree
 
 
 class Window(NamedTuple):
-    """What acting remembers: the last steps that are over, and the one that is not.
+    """What acting remembers: the last complete steps, and the one that still needs its action.
 
-    Steps begin at index 0, the oldest first; those beyond `length` mean nothing.
+    The oldest step is at index 0. Entries from index `length` on are not used.
     """
 
     obs: PyTree  # [N, C, ...]
     action: Array  # [N, C, A], what left from them
     length: Array  # [N] int32, steps held
     latest: PyTree  # [N, ...] the observation whose action is not known yet
-    waits: Array  # [N] bool, whether there is one
+    waits: Array  # [N] bool, whether there is such an observation
 
 
 def empty_window(spec: EnvSpec, context: int, batch_size: int) -> Window:
-    """Room for `context` steps, none of them there yet."""
+    """An empty window with room for `context` steps."""
 
     def room(shape: tuple[int, ...]) -> PyTree:
         return jax.tree.map(lambda x: jnp.zeros((*shape, *x.shape), x.dtype), spec.obs)
@@ -39,7 +39,7 @@ def empty_window(spec: EnvSpec, context: int, batch_size: int) -> Window:
 
 
 def remember(window: Window, action: Array) -> Window:
-    """`window` with the step that was waiting for `action`, if there was one."""
+    """Completes the step that waits for `action`, if there is one, and appends it."""
     context = window.action.shape[1]
     full = window.length == context
 
