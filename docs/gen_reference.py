@@ -24,7 +24,7 @@ OUTPUTS = NOTEBOOKS / "outputs"
 RESULTS = ROOT / "experiments" / "results"
 
 ORDER = {
-    "Losses": ("losses", "distributions"),
+    "Losses": ("losses",),
     "Data and choices": ("types", "config", "presets", "errors"),
     "World models and agents": ("world_model", "agent", "nets"),
     "Environments": ("envs",),

@@ -21,13 +21,14 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from vawm import distributions, losses, presets
+from vawm import losses, presets
 from vawm.agent import Agent, make_agent
 from vawm.cli import command_line, flags
 from vawm.config import Config, ValueAlignmentConfig
 from vawm.envs.protocol import check_positive
 from vawm.learning.alignment import make_value_alignment
 from vawm.losses import transforms
+from vawm.nets import distributions
 from vawm.process import cache
 from vawm.sweep.results import line
 from vawm.types import Array, Batch, EnvSpec, Inference, Key, Latent, PyTree, Trajectory, image

@@ -30,7 +30,7 @@ def scripted(spec, action, config=tiny.CONFIG):
         spec=spec,
         env_steps=0,
         params=None,
-        state=None,
+        model_state=None,
         initial=lambda n: jnp.zeros(n),
         apply=lambda params, state, key, carry, timestep, how: (
             carry,
@@ -219,7 +219,8 @@ def test_parameters_are_arguments_of_the_compiled_program(saved):
     second = policy.load(saved[0])
     second = second._replace(params=jax.tree.map(lambda x: x + 1, second.params))
     texts = [
-        play.player(env, p).lower(p.params, p.state, key).as_text() for p in (first, second)
+        play.player(env, p).lower(p.params, p.model_state, key).as_text()
+        for p in (first, second)
     ]
     assert texts[0] == texts[1]
 

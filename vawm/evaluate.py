@@ -64,7 +64,9 @@ def evaluate(
     if env.spec.num_envs != episodes:
         remedy = f"must equal the number of environments; use {env.spec.num_envs}"
         raise InvalidInput("episodes", episodes, remedy)
-    returns = play.player(env, policy, how)(policy.params, policy.state, jax.random.key(seed))
+    returns = play.player(env, policy, how)(
+        policy.params, policy.model_state, jax.random.key(seed)
+    )
     return Score(tuple(map(float, returns)))
 
 

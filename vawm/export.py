@@ -90,7 +90,7 @@ def export(
     weights.write(
         folder,
         policy.params,
-        policy.state,
+        policy.model_state,
         config=policy.config,
         spec=policy.spec,
         env_steps=policy.env_steps,

@@ -10,7 +10,7 @@ import tiny
 
 from vawm.agent import make_agent
 from vawm.agent.imagination import imagine
-from vawm.distributions import ActionDistribution
+from vawm.nets.distributions import ActionDistribution
 from vawm.types import Latent
 from vawm.world_model.protocol import WorldModel
 

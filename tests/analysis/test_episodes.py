@@ -66,7 +66,7 @@ def test_a_policy_that_watches_its_own_episodes_remembers_the_same(policy, recor
         agent = make_agent(policy.config, policy.spec)
         remember = jax.jit(functools.partial(episodes.remember, agent))
         key_act = jax.random.split(jax.random.key(3))[1]
-        memory = remember(policy.params, policy.state, key_act, record.trajectory)
+        memory = remember(policy.params, policy.model_state, key_act, record.trajectory)
         again = record._replace(memory=memory)
     assert jax.tree.structure(again.memory) == jax.tree.structure(record.memory)
     for actual, expected in zip(

@@ -38,7 +38,7 @@ class Setting(NamedTuple):
         """The states at the ends of `batch`, drawn as the maps were."""
         key = jax.random.split(jax.random.key(SEED))[0]
         inferred, _ = self.agent.world_model.follow(
-            self.policy.params.world_model, self.policy.state, key, batch, horizon=1
+            self.policy.params.world_model, self.policy.model_state, key, batch, horizon=1
         )
         return jax.tree.map(lambda x: x[:, -1], inferred)
 
@@ -64,7 +64,7 @@ def make_setting(config, spec, unit):
     data = make_episodes(policy, episodes=1, length=LENGTH)
     batch = episodes.windows(data, [0, 0], [0, LENGTH - CONTEXT], length=CONTEXT)
     make = jax.jit(saliency.make_saliency(agent, unit=unit))
-    maps = make(policy.params, policy.state, jax.random.key(SEED), batch)
+    maps = make(policy.params, policy.model_state, jax.random.key(SEED), batch)
     return Setting(policy, agent, data, batch, unit, maps)
 
 
@@ -103,7 +103,7 @@ def slow(setting, straight):
 
     def decode(z, h):
         one = Latent(h[None], z[None])
-        obs = agent.world_model.predict(policy.params.world_model, policy.state, one).obs
+        obs = agent.world_model.predict(policy.params.world_model, policy.model_state, one).obs
         return jax.tree.map(lambda x: x[0], some(obs))
 
     def value(z, h):

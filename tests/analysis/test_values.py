@@ -293,7 +293,7 @@ def explained(played):
     batch = episodes.windows(episodes.select(recorded, 0), [0], [0], length=13)
     explain = jax.jit(agent.world_model.explain)
     model = policy.params.world_model
-    return agent, batch, explain(model, policy.state, jax.random.split(key)[0], batch)[0]
+    return agent, batch, explain(model, policy.model_state, jax.random.split(key)[0], batch)[0]
 
 
 def test_one_step_ahead_the_latent_kl_is_that_of_training(played, explained):
@@ -322,7 +322,9 @@ def test_a_prior_is_that_of_the_next_step(played, explained):
         return
     latent = jax.tree.map(lambda x: x[0, :-1], explanation.inference.latent)
     action = batch.trajectory.action[0, 1:-1]
-    logits = jax.jit(prior)(policy.params, policy.state, jax.random.key(1), latent, action)
+    logits = jax.jit(prior)(
+        policy.params, policy.model_state, jax.random.key(1), latent, action
+    )
     expected = explanation.inference.prior_logits[0, 1:]
     np.testing.assert_allclose(logits, expected, atol=1e-5)
 

@@ -29,7 +29,7 @@ def make_policy(config, spec, seed=0):
 def save_run(logdir, policy, *, env_steps=8):
     """The folder of a run that saved what is needed to act, with two lines of metrics."""
     state = toy.state()
-    learner = state.learner._replace(params=policy.params, model_state=policy.state)
+    learner = state.learner._replace(params=policy.params, model_state=policy.model_state)
     checkpoint.save(
         logdir,
         state._replace(learner=learner),

@@ -17,8 +17,8 @@ import tiny
 
 from vawm.agent import Agent
 from vawm.agent.actor_critic import Actor, Critic
-from vawm.distributions import ActionDistribution
 from vawm.losses import transforms
+from vawm.nets.distributions import ActionDistribution
 from vawm.types import (
     EnvSpec,
     Explanation,

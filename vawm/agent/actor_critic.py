@@ -8,12 +8,13 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from vawm import distributions, nets
+from vawm import nets
 from vawm.config import ActorConfig, CriticConfig
-from vawm.distributions import ActionDistribution
 from vawm.errors import InvalidInput
 from vawm.losses import transforms
 from vawm.losses.transforms import TwoHot
+from vawm.nets import distributions
+from vawm.nets.distributions import ActionDistribution
 from vawm.types import Array, EnvSpec, Key, Latent, PyTree, features
 
 

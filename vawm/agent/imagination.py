@@ -7,7 +7,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from vawm.distributions import ActionDistribution
+from vawm.nets.distributions import ActionDistribution
 from vawm.types import Imagined, Key, Latent, PyTree
 from vawm.world_model.protocol import WorldModel
 

@@ -6,10 +6,11 @@ from collections.abc import Callable
 
 import jax
 
-from vawm import distributions, losses
+from vawm import losses
 from vawm.agent.actor_critic import Critic
 from vawm.config import VagramConfig
 from vawm.losses import transforms
+from vawm.nets import distributions
 from vawm.types import Array, Inference, Latent, PyTree, flat_stoch
 
 FORMS = {

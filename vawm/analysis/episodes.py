@@ -89,10 +89,10 @@ def record_in(
         raise InvalidInput("env", env.spec.task, "set the episode_length of its spec")
 
     def play(params: Params, state: PyTree, key: Key) -> Episodes:
-        own = policy._replace(params=params, state=state)
+        own = policy._replace(params=params, model_state=state)
         return on_device(env, own, agent, key, how=how)
 
-    return jax.jit(play)(policy.params, policy.state, jax.random.key(seed))
+    return jax.jit(play)(policy.params, policy.model_state, jax.random.key(seed))
 
 
 def on_device(
@@ -199,7 +199,7 @@ def watched_by(policy: Policy, episodes: Episodes, *, seed: int) -> Episodes:
     agent = make_agent(policy.config, policy.spec)
     infer = jax.jit(functools.partial(remember, agent))
     key = jax.random.key(seed)
-    memory = infer(policy.params, policy.state, key, episodes.trajectory)
+    memory = infer(policy.params, policy.model_state, key, episodes.trajectory)
     return episodes._replace(memory=memory)
 
 

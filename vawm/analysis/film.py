@@ -73,7 +73,7 @@ def make(
 
     key = jax.random.key(seed)
     decoded, value = jax.device_get(
-        jax.jit(compute)(policy.params, policy.state, key, batch, truth)
+        jax.jit(compute)(policy.params, policy.model_state, key, batch, truth)
     )
     weight = saliency.images(truth, value)
     assert weight is not None  # the policy observes images

@@ -34,10 +34,10 @@ import numpy as np
 from vawm.agent import Agent, make_agent
 from vawm.analysis import inference
 from vawm.analysis.episodes import Episodes, windows
-from vawm.distributions import on_simplex
 from vawm.envs.protocol import check_positive
 from vawm.errors import InvalidInput
 from vawm.losses import transforms
+from vawm.nets.distributions import on_simplex
 from vawm.policy import Policy
 from vawm.types import Array, Batch, Key, Latent, Params, PyTree, is_image
 
@@ -252,7 +252,7 @@ def look(
     batch = windows(episodes, np.zeros_like(step), step - (context - 1), length=context)
     agent = make_agent(policy.config, policy.spec)
     maps = jax.jit(make_saliency(agent, unit=unit))(
-        policy.params, policy.state, jax.random.key(seed), batch
+        policy.params, policy.model_state, jax.random.key(seed), batch
     )
     truth = jax.tree.map(lambda x: x[:, -1], batch.trajectory.obs)
     return Look(step, jax.device_get(truth), jax.device_get(maps), unit)

@@ -62,7 +62,9 @@ def imagine(
     start, batch = draw(episodes, length=context + depth + 1, seed=seed, at_most=at_most)
     length = np.asarray(episodes.length)[:at_most]
     open_loop = jax.jit(make_open_loop(agent, context=context))
-    predicted = open_loop(policy.params, policy.state, jax.random.key(seed), batch).predicted
+    predicted = open_loop(
+        policy.params, policy.model_state, jax.random.key(seed), batch
+    ).predicted
     time = start[:, None] + np.arange(1, context + depth + 1)
     return Trajectories(
         start=start + 1,

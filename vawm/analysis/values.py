@@ -224,7 +224,7 @@ def report(
     rollouts = jax.jit(make_rollouts(agent, policy.config, context=context, depth=depth))
     keys = jax.random.split(jax.random.key(seed), len(episodes.length))
     rolled = [
-        jax.device_get(rollouts(policy.params, policy.state, key, select(episodes, i)))
+        jax.device_get(rollouts(policy.params, policy.model_state, key, select(episodes, i)))
         for i, key in enumerate(keys)
     ]
     return compare(

@@ -70,7 +70,7 @@ def player(env: Environment, policy: Policy, how: How = "sample") -> jax.stages.
     """`(params, state, key) -> returns`, jitted once for all checkpoints of a run."""
 
     def play(params: Params, state: PyTree, key: Array) -> Array:
-        return on_device(env, policy._replace(params=params, state=state), key, how)
+        return on_device(env, policy._replace(params=params, model_state=state), key, how)
 
     return jax.jit(play)
 

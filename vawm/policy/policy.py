@@ -30,9 +30,9 @@ class Policy(NamedTuple):
       spec: of the environment it was trained in.
       env_steps: at which the checkpoint was written.
       params: the parameters.
-      state: the world model's state besides its parameters.
+      model_state: what the world model carries besides its parameters.
       initial: `(batch_size) -> carry`, before the first observation.
-      apply: `(params, state, key, carry, timestep, *, how) -> (carry, action [N, A])`,
+      apply: `(params, model_state, key, carry, timestep, *, how) -> (carry, action [N, A])`,
         jitted and pure.
     """
 
@@ -40,7 +40,7 @@ class Policy(NamedTuple):
     spec: EnvSpec
     env_steps: int
     params: Params
-    state: PyTree
+    model_state: PyTree
     initial: Callable[[int], PolicyCarry]
     apply: Callable[..., tuple[PolicyCarry, Array]]
 
@@ -52,7 +52,7 @@ class Policy(NamedTuple):
         how: Literal["sample", "mode"] = "sample",
     ) -> tuple[PolicyCarry, Array]:
         """The next carry and a raw action `[N, A]`: sampled, or the policy's mode."""
-        return self.apply(self.params, self.state, key, carry, timestep, how=how)
+        return self.apply(self.params, self.model_state, key, carry, timestep, how=how)
 
 
 def load(logdir: str | os.PathLike[str]) -> Policy:
@@ -99,13 +99,13 @@ def _policy(
     agent = make_agent(of.config, of.spec)
     shapes = jax.eval_shape(agent.init, jax.random.key(0))
     budget.check_policy(shapes, of.config)
-    params, state = read(*shapes)
+    params, model_state = read(*shapes)
     return Policy(
         config=of.config,
         spec=of.spec,
         env_steps=of.env_steps,
         params=params,
-        state=state,
+        model_state=model_state,
         initial=agent.initial,
         apply=jax.jit(agent.act, static_argnames="how"),
     )

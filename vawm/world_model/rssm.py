@@ -8,8 +8,9 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 
-from vawm import distributions, nets
+from vawm import nets
 from vawm.config import RSSMConfig
+from vawm.nets import distributions
 from vawm.types import (
     Array,
     Batch,

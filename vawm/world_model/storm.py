@@ -8,9 +8,9 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 
-from vawm import distributions, nets
+from vawm import nets
 from vawm.config import StormConfig
-from vawm.nets import Cache
+from vawm.nets import Cache, distributions
 from vawm.types import (
     Array,
     Batch,

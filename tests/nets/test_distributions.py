@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vawm import distributions
+from vawm.nets import distributions
 
 sample_index = jax.jit(distributions.sample_index, static_argnames="unimix")
 sample_one_hot = jax.jit(distributions.sample_one_hot, static_argnames="unimix")
