@@ -107,9 +107,10 @@ def test_sweeps_know_it(tmp_path):
 
 def test_the_program_trains_on_mjx(own, tmp_path, monkeypatch):
     monkeypatch.setattr(command_line.cache, "enable", lambda: None)
-    flags = """--num-envs 2 --env-steps 600 --train-ratio 2 --log-every 100
-      --replay.batch-size 2 --replay.batch-length 8 --world-model.deter 32 --world-model.units 16 --critic.units 16
-      --actor.units 16 --imagination.horizon 3"""
+    sizes = "--world-model.deter 32 --world-model.units 16 --critic.units 16 --actor.units 16"
+    batch = "--replay.batch-size 2 --replay.batch-length 8 --imagination.horizon 3"
+    run = "--num-envs 2 --env-steps 600 --train-ratio 2 --log-every 100"
+    flags = f"{run} {batch} {sizes}"
     logdir = tmp_path / "run"
     assert own.main([*flags.split(), "--logdir", str(logdir)]) == 0
     policy = vawm.load(logdir)
