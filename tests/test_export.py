@@ -63,7 +63,7 @@ def copy(exported, tmp_path):
 
 def test_the_weights_are_restored_bit_for_bit(logdir, exported):
     trained, loaded = policy.load(logdir), vawm.load(exported)
-    toy.assert_equal((loaded.params, loaded.state), (trained.params, trained.state))
+    toy.assert_equal((loaded.params, loaded.model_state), (trained.params, trained.model_state))
     assert loaded[:3] == trained[:3] == (tiny.CONFIG, tiny.env().spec, 32)
     names = sorted(path.name for path in exported.iterdir())
     assert names == ["README.md", "config.json", "model.safetensors"]
@@ -136,7 +136,7 @@ def test_the_documented_lines_act_in_a_process_that_never_trained(tmp_path, task
         made.close()
     card = export.card(trained, "")
     usual = {"config": config, "spec": made.spec, "env_steps": 32, "card": card}
-    weights.write(tmp_path / "cartpole", trained.params, trained.state, **usual)
+    weights.write(tmp_path / "cartpole", trained.params, trained.model_state, **usual)
     shown = card.partition("```python\n")[2].partition("```")[0]
     blocks = [shown.replace("FOLDER", "cartpole")]
     if not changes:
