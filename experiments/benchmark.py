@@ -114,7 +114,8 @@ def size_of(options: Benchmark) -> str:
 def paper_of(agent: str) -> Config:
     """The paper's preset of an agent, for the proprio tasks if there is one."""
     of_suites = registry.kind(agent).presets.values()
-    return next(named["paper"] for named in of_suites if "paper" in named)
+    papers = [named["paper"] for named in of_suites if "paper" in named]
+    return papers[0] if papers else next(iter(next(iter(of_suites)).values()))
 
 
 def make_config(options: Benchmark) -> Config:

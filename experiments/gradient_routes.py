@@ -79,7 +79,7 @@ def routes(agent: Agent, config: Config, options: Options) -> dict[str, list[lis
 
     def norms(seed: Array, alignment: ValueAlignmentConfig) -> list[Array]:
         key_init, key_batch, key_explain = jax.random.split(jax.random.key(seed), 3)
-        params, state = agent.init(key_init)
+        params, model_state = agent.init(key_init)
         shape = options.batch_size, options.batch_length + 1
         batch = random_batch(agent.spec, key_batch, shape)
         aligned = make_value_alignment(
@@ -87,7 +87,7 @@ def routes(agent: Agent, config: Config, options: Options) -> dict[str, list[lis
         )
 
         def explain(world_model: PyTree) -> Inference:
-            return agent.world_model.explain(world_model, state, key_explain, batch)[
+            return agent.world_model.explain(world_model, model_state, key_explain, batch)[
                 0
             ].inference
 

@@ -84,12 +84,11 @@ def gru(config: GRUConfig, spec: EnvSpec, *, dtype, noise) -> WorldModel:
         uniform = jax.random.uniform(key, logits.shape[:-1])
         return distributions.sample_one_hot(logits, uniform, unimix=config.unimix)
 
-    def observe(params, model_state, key, latent, obs, prev_action, is_first):
+    def observe(params, key, latent, tokens, prev_action, is_first):
         """One step of `[N, ...]`: everything is zero before the first step of an episode."""
         keep = 1.0 - is_first[:, None]
         latent = Latent(latent.deter * keep, latent.stoch * keep[..., None])
         deter = advance(params, latent, prev_action * keep)
-        tokens, _ = heads.encode(params, model_state, obs)
         post = logits(params["post"], jnp.concatenate([deter, tokens], axis=-1))
         prior = logits(params["prior"], deter)
         key_post, key_prior = jax.random.split(key)
@@ -101,20 +100,22 @@ def gru(config: GRUConfig, spec: EnvSpec, *, dtype, noise) -> WorldModel:
     def observe_batch(params, model_state, key, batch):
         """Steps 1..T of a batch, `[B, T, ...]`; action t - 1 led to observation t."""
         time_major = jax.tree.map(lambda x: x.swapaxes(0, 1), batch.trajectory)
-        arrived = jax.tree.map(lambda x: x[1:], (time_major.obs, time_major.is_first))
+        obs, is_first = jax.tree.map(lambda x: x[1:], (time_major.obs, time_major.is_first))
+        tokens, _ = heads.encode(params, model_state, obs)  # all at once, outside of the scan
 
         def step(latent, inputs):
-            key, prev_action, (obs, is_first) = inputs
-            inference = observe(params, model_state, key, latent, obs, prev_action, is_first)
+            key, *arrived = inputs
+            inference = observe(params, key, latent, *arrived)
             return inference.latent, inference
 
-        left = time_major.action[:-1]
-        inputs = jax.random.split(key, len(left)), left, arrived
+        keys = jax.random.split(key, len(is_first))
+        inputs = keys, tokens, time_major.action[:-1], is_first
         _, inference = jax.lax.scan(step, batch.context, inputs)
         return jax.tree.map(lambda x: x.swapaxes(0, 1), inference)
 
-    def filter_step(*arguments):
-        latent = observe(*arguments).latent
+    def filter_step(params, model_state, key, latent, obs, prev_action, is_first):
+        tokens, _ = heads.encode(params, model_state, obs)
+        latent = observe(params, key, latent, tokens, prev_action, is_first).latent
         return latent, latent
 
     def explain(params, model_state, key, batch):

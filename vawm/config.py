@@ -228,7 +228,7 @@ class ValueAlignmentConfig:
     representation_scale: float = 0.1
     """on KL[V(s) || sg V(s~)]; 0 gives the gradient of Eq. 4 as printed"""
     critic: Literal["online", "slow"] = "online"
-    """which critic L_var asks; its parameters are stopped"""
+    """the critic that L_var uses, with stopped parameters"""
     deter_gradient: Literal["live", "stop"] = "live"
     """whether L_var has a gradient to h_t through the critic's input"""
     noise: Literal["independent", "shared"] = "independent"
@@ -385,9 +385,9 @@ class Config:
     """the world model: recurrent (dreamerv3), a transformer (storm), recurrent without noise
     (vagram), or one that was registered"""
     preset: str = "paper"
-    """set of defaults for the other numbers; custom: a set of your own"""
+    """set of defaults for the other numbers; custom: all set by flags"""
     size: str = "12m"
-    """set of widths of the networks; custom: widths of your own"""
+    """set of widths of the networks; custom: widths set by flags"""
     seed: int = 0
     """of parameters, environments and everything that is sampled"""
     env_steps: int = 500_000

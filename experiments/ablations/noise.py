@@ -13,6 +13,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
+from vawm.agent import registry
 from vawm.cli import command_line
 from vawm.errors import InvalidInput
 from vawm.sweep import ablation
@@ -21,7 +22,7 @@ from vawm.sweep.runs import Variant
 
 def variants(agent: str) -> tuple[Variant, ...]:
     """Both variants; refuses an agent that does not sample z."""
-    if agent == "vagram":
+    if not registry.kind(agent).samples_latents:
         raise InvalidInput("agent", agent, "does not sample z, so has no noise; use another")
     return tuple(
         Variant(noise, (*ablation.ADAPTIVE, "--value-alignment.noise", noise))

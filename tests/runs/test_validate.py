@@ -115,7 +115,7 @@ def test_every_rule_is_about_a_field():
         ("actor.min_std", 2.0, "at most actor.max_std"),
         ("replay.capacity", 31, "at least 32, or smaller batches than 2 x 8"),
         ("env_steps", 31, "at least 32, what the first update needs"),
-        ("num_envs", 20, "gets to hold 3 steps of each and needs 9; use 5"),
+        ("num_envs", 20, "use 5"),
         ("collect_steps", 33, "at most 32"),
         ("seed", 2**32, "from 0 to 4294967295"),
         ("replay.batch_length", 1, "at least 2"),

@@ -164,7 +164,7 @@ def test_the_scale_of_the_paper_has_its_games():
 @pytest.mark.parametrize(
     ("script", "words", "message"),
     [
-        ("weight", ["--agent", "dreamer"], "agent='dreamer': "),
+        ("weight", ["--agent", "dreamer"], "--agent='dreamer': "),
         ("weight", ["--scale", "papr"], "--scale='papr': "),
         ("weight", ["--tasks", "walker_wlak"], "task='walker_wlak': "),
         ("noise", ["--seeds", "1", "1"], "seeds=(1, 1): "),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
+from typing import cast
 
 from vawm import config, nets, presets
 from vawm.agent.registry import Activations, register
@@ -38,8 +39,7 @@ STORM_RULES = {
 
 def check_rssm(config: Config) -> None:
     """Refuses widths that do not divide into blocks."""
-    model = config.world_model
-    assert isinstance(model, RSSMConfig)
+    model = cast(RSSMConfig, config.world_model)
     if model.deter % model.blocks:
         remedy = f"use a multiple of world_model.blocks={model.blocks}"
         raise InvalidInput("world_model.deter", model.deter, remedy)
@@ -52,9 +52,8 @@ def check_rssm(config: Config) -> None:
 
 def check_storm(config: Config) -> None:
     """Refuses what a transformer with learned positions cannot train on or imagine."""
-    model, imagination = config.world_model, config.imagination
+    model, imagination = cast(StormConfig, config.world_model), config.imagination
     length = config.replay.batch_length
-    assert isinstance(model, StormConfig)
     if model.deter % model.heads:
         remedy = f"use a multiple of world_model.heads={model.heads}"
         raise InvalidInput("world_model.deter", model.deter, remedy)
@@ -77,8 +76,7 @@ def check_storm(config: Config) -> None:
 
 def rssm_activations(config: Config, image_size: int | None) -> Activations:
     """Of the layers around h, and of the CNNs, whose stages halve after their convolution."""
-    model, critic = config.world_model, config.critic
-    assert isinstance(model, RSSMConfig)
+    model, critic = cast(RSSMConfig, config.world_model), config.critic
     layers = (
         model.encoder_layers
         + model.decoder_layers
@@ -94,8 +92,8 @@ def rssm_activations(config: Config, image_size: int | None) -> Activations:
 
 def storm_activations(config: Config, image_size: int | None) -> Activations:
     """Of the transformer and the heads, and of the CNNs, which halve before they convolve."""
-    model, imagination, critic = config.world_model, config.imagination, config.critic
-    assert isinstance(model, StormConfig)
+    model = cast(StormConfig, config.world_model)
+    imagination, critic = config.imagination, config.critic
     attention = 2 * model.heads * config.replay.batch_length
     block = 8 * model.deter + 2 * model.feedforward + attention
     layers = 2 * model.head_layers + 2 * model.vector_layers + 2 * critic.layers
@@ -150,6 +148,7 @@ def register_all() -> None:
         sizes=rssm_sizes,
         presets=presets.VAGRAM_PRESETS,
         rules=VAGRAM_RULES,
+        samples_latents=False,
         check=check_rssm,
         activations=rssm_activations,
         make_latent_loss=make_value_gradient_loss,

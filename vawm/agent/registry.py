@@ -58,6 +58,7 @@ class AgentKind(NamedTuple):
       activations: `(config, image_size) -> Activations`; `image_size` is None without images.
       context_limited: whether the world model knows only as many positions as a training
         sequence has, so that nothing longer can be imagined.
+      samples_latents: whether z and z~ are sampled, so that their noise is a choice.
       make_latent_loss: `(critic, config.world_model) -> loss(critic_params, slow_critic_params,
         inference) -> [B, T]`, a further loss of the world model; None for none.
     """
@@ -71,6 +72,7 @@ class AgentKind(NamedTuple):
     check: Callable[[Config], None]
     activations: Callable[[Config, int | None], Activations]
     context_limited: bool
+    samples_latents: bool
     make_latent_loss: Callable[..., Callable[..., Any]] | None
 
 
@@ -100,6 +102,7 @@ def register(
     check: Callable[[Config], None] | None = None,
     activations: Callable[[Config, int | None], Activations] | None = None,
     context_limited: bool = False,
+    samples_latents: bool = True,
     make_latent_loss: Callable[..., Callable[..., Any]] | None = None,
 ) -> None:
     """Adds a kind of agent; the arguments are the attributes of `AgentKind`.
@@ -133,6 +136,7 @@ def register(
         check=check or (lambda config: None),
         activations=activations or default_activations,
         context_limited=context_limited,
+        samples_latents=samples_latents,
         make_latent_loss=make_latent_loss,
     )
 

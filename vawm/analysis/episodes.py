@@ -88,8 +88,8 @@ def record_in(
     if env.spec.episode_length is None:
         raise InvalidInput("env", env.spec.task, "set the episode_length of its spec")
 
-    def play(params: Params, state: PyTree, key: Key) -> Episodes:
-        own = policy._replace(params=params, model_state=state)
+    def play(params: Params, model_state: PyTree, key: Key) -> Episodes:
+        own = policy._replace(params=params, model_state=model_state)
         return on_device(env, own, agent, key, how=how)
 
     return jax.jit(play)(policy.params, policy.model_state, jax.random.key(seed))
@@ -163,7 +163,7 @@ def join(episodes: Sequence[Sequence[PyTree]]) -> Episodes:
 
 
 def remember(
-    agent: Agent, params: Params, state: PyTree, key: Key, trajectory: Trajectory
+    agent: Agent, params: Params, model_state: PyTree, key: Key, trajectory: Trajectory
 ) -> PyTree:
     """`[E, T, ...]` the memory that this agent would have after watching the recorded steps.
 
@@ -174,7 +174,7 @@ def remember(
     Args:
       agent: with the world model that watches.
       params: of the agent.
-      state: of its world model.
+      model_state: of its world model.
       key: for sampling latents.
       trajectory: `[E, T, ...]`, from the first steps of episodes on.
     """
@@ -182,7 +182,7 @@ def remember(
 
     def step(carry: PolicyCarry, inputs: tuple[Key, Trajectory]):
         key, (*arrived, action) = inputs
-        carry, _ = agent.act(params, state, key, carry, TimeStep(*arrived))
+        carry, _ = agent.act(params, model_state, key, carry, TimeStep(*arrived))
         return carry._replace(action=action), agent.world_model.memory(carry.memory)
 
     steps = jax.tree.map(lambda x: x.swapaxes(0, 1), trajectory)

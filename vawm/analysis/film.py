@@ -66,10 +66,10 @@ def make(
     truth = jax.tree.map(lambda x: x[0, 1:], batch.trajectory.obs)
     states, maps = make_states(agent, context=context), saliency.value_map(agent, unit=unit)
 
-    def compute(params, state, key, batch, truth):
-        parts = states(params, state, key, batch)
+    def compute(params, model_state, key, batch, truth):
+        parts = states(params, model_state, key, batch)
         latent = jax.tree.map(lambda a, b: jnp.concatenate([a[0], b[0]]), *parts)
-        return maps(params, state, latent, truth)
+        return maps(params, model_state, latent, truth)
 
     key = jax.random.key(seed)
     decoded, value = jax.device_get(

@@ -42,7 +42,7 @@ Infer = Callable[[Params, PyTree, Key, Episodes], Inferred]
 
 
 def make_infer(agent: Agent, *, context: int, horizon: int) -> Infer:
-    """Builds `infer(params, state, key, episode) -> Inferred`; `episode` has E = 1.
+    """Builds `infer(params, model_state, key, episode) -> Inferred`; `episode` has E = 1.
 
     No gradient is stopped here.
 
@@ -53,22 +53,26 @@ def make_infer(agent: Agent, *, context: int, horizon: int) -> Infer:
     """
     world_model = agent.world_model
 
-    def from_states(params: Params, state: PyTree, key: Key, episode: Episodes) -> Inferred:
+    def from_states(
+        params: Params, model_state: PyTree, key: Key, episode: Episodes
+    ) -> Inferred:
         model, starts = params.world_model, world_model.starts
         assert starts is not None
         key_explain, key_imagine = jax.random.split(key)
         whole = windows(episode, [0], [0], length=episode.trajectory.reward.shape[1])
-        inference = world_model.explain(model, state, key_explain, whole)[0].inference
-        carry, latent = starts(model, state, inference)
+        inference = world_model.explain(model, model_state, key_explain, whole)[0].inference
+        carry, latent = starts(model, model_state, inference)
         action = whole.trajectory.action[0, 1:]
-        ahead = world_model.imagine(model, state, key_imagine, carry, action)
+        ahead = world_model.imagine(model, model_state, key_imagine, carry, action)
         return Inferred(latent, inference.post_logits[0], ahead)
 
-    def from_windows(params: Params, state: PyTree, key: Key, episode: Episodes) -> Inferred:
+    def from_windows(
+        params: Params, model_state: PyTree, key: Key, episode: Episodes
+    ) -> Inferred:
         start = jnp.arange(episode.trajectory.reward.shape[1] - context + 1)
         batch = windows(episode, jnp.zeros_like(start), start, length=context)
         inferred, ahead = world_model.follow(
-            params.world_model, state, key, batch, horizon=horizon
+            params.world_model, model_state, key, batch, horizon=horizon
         )
         return Inferred(jax.tree.map(lambda x: x[:, -1], inferred), None, ahead)
 
@@ -76,7 +80,7 @@ def make_infer(agent: Agent, *, context: int, horizon: int) -> Infer:
 
 
 def make_prior(agent: Agent) -> Callable[..., Array] | None:
-    """Builds `prior(params, state, key, latent, action) -> logits [N, S, K]`, before unimix.
+    """Builds `prior(params, model_state, key, latent, action) -> logits [N, S, K]`.
 
     The logits of p(z_{t+1} | h_{t+1}) after `latent` and `action`, as `explain` computes them
     for a sequence that starts with this state. None for a world model without `starts`.
@@ -85,7 +89,9 @@ def make_prior(agent: Agent) -> Callable[..., Array] | None:
     if world_model.starts is None:
         return None
 
-    def prior(params: Params, state: PyTree, key: Key, latent: Latent, action: Array) -> Array:
+    def prior(
+        params: Params, model_state: PyTree, key: Key, latent: Latent, action: Array
+    ) -> Array:
         size = action.shape[0]
 
         def blank(leaf):
@@ -101,7 +107,7 @@ def make_prior(agent: Agent) -> Callable[..., Array] | None:
             action=jnp.stack([action, jnp.zeros_like(action)], axis=1),
         )
         batch = Batch(steps, world_model.memory(latent))
-        explanation, _ = world_model.explain(params.world_model, state, key, batch)
+        explanation, _ = world_model.explain(params.world_model, model_state, key, batch)
         return explanation.inference.prior_logits[:, 0]
 
     return prior

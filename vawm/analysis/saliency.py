@@ -61,7 +61,7 @@ class Saliency(NamedTuple):
 def make_saliency(
     agent: Agent, *, unit: Unit = "symlog", probes: int = 128
 ) -> Callable[[Params, PyTree, Key, Batch], Saliency]:
-    """Builds `saliency(params, state, key, batch) -> Saliency`, of the last step of each row.
+    """Builds `saliency(params, model_state, key, batch) -> Saliency`, of each row's last step.
 
     Args:
       agent: the agent.
@@ -73,7 +73,7 @@ def make_saliency(
     world_model = agent.world_model
     value = make_value(agent, unit=unit)
 
-    def saliency(params: Params, state: PyTree, key: Key, batch: Batch) -> Saliency:
+    def saliency(params: Params, model_state: PyTree, key: Key, batch: Batch) -> Saliency:
         key_follow, key_probe = jax.random.split(key)
         model = params.world_model
 
@@ -85,7 +85,7 @@ def make_saliency(
                 obs,
             )
             seen = batch._replace(trajectory=batch.trajectory._replace(obs=joined))
-            inferred, _ = world_model.follow(model, state, key_follow, seen, horizon=1)
+            inferred, _ = world_model.follow(model, model_state, key_follow, seen, horizon=1)
             return jax.tree.map(lambda x: x[:, -1], inferred)
 
         def value_after(obs: PyTree) -> tuple[Array, Latent]:
@@ -99,7 +99,7 @@ def make_saliency(
             sign = jax.random.rademacher(key, latent.stoch.shape, latent.stoch.dtype)
             return jax.tree.map(lambda t, x: t + jnp.square(x), total, push(sign)), None
 
-        decoded, push, slope = around(agent, value, params, state, latent)
+        decoded, push, slope = around(agent, value, params, model_state, latent)
         zero = jax.tree.map(jnp.zeros_like, decoded)
         squares, _ = jax.lax.scan(probe, zero, jax.random.split(key_probe, probes))
         return Saliency(
@@ -128,7 +128,7 @@ def around(
     agent: Agent,
     value: Callable[[Params, Latent], Array],
     params: Params,
-    state: PyTree,
+    model_state: PyTree,
     latent: Latent,
 ) -> tuple[PyTree, Callable[[Array], PyTree], Array]:
     """Linearises decoder and value at F states, along the simplex of z.
@@ -140,7 +140,7 @@ def around(
 
     def decode(stoch: Array) -> PyTree:
         on_it = Latent(deter, on_simplex(stoch))
-        return agent.world_model.predict(params.world_model, state, on_it).obs
+        return agent.world_model.predict(params.world_model, model_state, on_it).obs
 
     # No network mixes rows, so the gradient of the sum contains that of each row.
     slope = jax.grad(lambda z: value(params, Latent(deter, on_simplex(z))).sum())(stoch)
@@ -150,7 +150,7 @@ def around(
 def value_map(
     agent: Agent, *, unit: Unit = "symlog"
 ) -> Callable[[Params, PyTree, Latent, PyTree], tuple[PyTree, PyTree]]:
-    """Builds `maps(params, state, latent, like) -> (decoded, value)` for any F states.
+    """Builds `maps(params, model_state, latent, like) -> (decoded, value)` for any F states.
 
     Args:
       agent: the agent.
@@ -163,9 +163,9 @@ def value_map(
     value = make_value(agent, unit=unit)
 
     def maps(
-        params: Params, state: PyTree, latent: Latent, like: PyTree
+        params: Params, model_state: PyTree, latent: Latent, like: PyTree
     ) -> tuple[PyTree, PyTree]:
-        decoded, push, slope = around(agent, value, params, state, latent)
+        decoded, push, slope = around(agent, value, params, model_state, latent)
         return decoded, norms(push(slope), like)
 
     return maps

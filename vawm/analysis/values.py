@@ -63,7 +63,7 @@ class Rollouts(NamedTuple):
 def make_rollouts(
     agent: Agent, config: Config, *, context: int, depth: int
 ) -> Callable[[Params, PyTree, Key, Episodes], Rollouts]:
-    """Builds `rollouts(params, state, key, episode) -> Rollouts`; `episode` has E = 1.
+    """Builds `rollouts(params, model_state, key, episode) -> Rollouts`; `episode` has E = 1.
 
     The N states are the last N steps of the record. Depths beyond its end repeat its last step
     and are meaningless. No gradient is stopped.
@@ -79,9 +79,9 @@ def make_rollouts(
         mixed = [transforms.unimix_logits(logits, model.unimix) for logits in pair]
         return transforms.categorical_kl(*mixed).sum(-1)
 
-    def rollouts(params: Params, state: PyTree, key: Key, episode: Episodes) -> Rollouts:
+    def rollouts(params: Params, model_state: PyTree, key: Key, episode: Episodes) -> Rollouts:
         key_infer, key_prior, key_imagine = jax.random.split(key, 3)
-        inferred = infer(params, state, key_infer, episode)
+        inferred = infer(params, model_state, key_infer, episode)
         count = inferred.latent.deter.shape[0]
         action = episode.trajectory.action[0, -count:]
         value_logits = critic.logits(params.critic, inferred.latent)
@@ -93,11 +93,11 @@ def make_rollouts(
         def prior_logits(key: Key, latent: Latent, action: Array) -> Array | None:
             if prior is None or inferred.post_logits is None:
                 return None
-            return prior(params, state, key, latent, action)
+            return prior(params, model_state, key, latent, action)
 
         def look(latent: Latent, logits: Array | None, k: Array | int) -> Rollouts:
             here = critic.logits(params.critic, latent)
-            reward = world_model.predict(params.world_model, state, latent).reward
+            reward = world_model.predict(params.world_model, model_state, latent).reward
             gap = jnp.square(latent.stoch - later(inferred.latent.stoch, k))
             value = critic.code.mean(here)
             latents = jnp.full_like(value, jnp.nan)
@@ -118,7 +118,7 @@ def make_rollouts(
             leaves = later(action, k)
             logits = prior_logits(key_prior, latent, leaves)
             carry, latent = world_model.imagine(
-                params.world_model, state, key_imagine, carry, leaves
+                params.world_model, model_state, key_imagine, carry, leaves
             )
             return (carry, latent, logits), seen
 

@@ -67,10 +67,10 @@ class Loop(NamedTuple):
 
 
 def player(env: Environment, policy: Policy, how: How = "sample") -> jax.stages.Wrapped:
-    """`(params, state, key) -> returns`, jitted once for all checkpoints of a run."""
+    """`(params, model_state, key) -> returns`, jitted once for all checkpoints of a run."""
 
-    def play(params: Params, state: PyTree, key: Array) -> Array:
-        return on_device(env, policy._replace(params=params, model_state=state), key, how)
+    def play(params: Params, model_state: PyTree, key: Array) -> Array:
+        return on_device(env, policy._replace(params=params, model_state=model_state), key, how)
 
     return jax.jit(play)
 

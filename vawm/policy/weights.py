@@ -54,8 +54,13 @@ MAX_BYTES = 2**24
 
 
 WRONG = (
-    *(OSError, ValueError, TypeError, KeyError, AttributeError),
-    *(OverflowError, RecursionError),  # from huge numbers and deep nesting
+    OSError,
+    ValueError,
+    TypeError,
+    KeyError,
+    AttributeError,
+    OverflowError,
+    RecursionError,  # from huge numbers and deep nesting
 )
 """Exceptions that a `config.json` with wrong content raises."""
 
@@ -103,7 +108,7 @@ def check_output(folder: pathlib.Path) -> None:
 def write(
     folder: pathlib.Path,
     params: Params,
-    state: PyTree,
+    model_state: PyTree,
     *,
     config: Config,
     spec: EnvSpec,
@@ -119,7 +124,7 @@ def write(
     check_output(folder)
     validate.check(config)
     validate.check_spec(config, spec)
-    leaves = {name: np.asarray(leaf) for name, leaf in _flatten(params, state).items()}
+    leaves = {name: np.asarray(leaf) for name, leaf in _flatten(params, model_state).items()}
     scratch = folder.absolute().with_name(f".{folder.name}.tmp-{os.getpid()}")
     content = {
         "format": FORMAT,
@@ -188,17 +193,20 @@ def _content(path: pathlib.Path) -> dict[str, Any]:
 
 
 def read(
-    folder: str | os.PathLike[str], description: Description, params: PyTree, state: PyTree
+    folder: str | os.PathLike[str],
+    description: Description,
+    params: PyTree,
+    model_state: PyTree,
 ) -> tuple[PyTree, PyTree]:
     """Reads the weights in `folder` into trees like those given.
 
-    `params` and `state` may hold arrays or `ShapeDtypeStruct`s.
+    `params` and `model_state` may hold arrays or `ShapeDtypeStruct`s.
 
     Raises:
       InvalidInput: a name, shape or dtype differs, or the file is damaged.
     """
     path = pathlib.Path(folder).expanduser() / MODEL
-    expected = _flatten(params, state)
+    expected = _flatten(params, model_state)
     infos = {name: manifest.leaf_info(leaf) for name, leaf in expected.items()}
     try:
         with safetensors.safe_open(path, framework="numpy") as file:
@@ -210,11 +218,11 @@ def read(
             leaves = {name: jnp.array(file.get_tensor(name)) for name in expected}
     except (OSError, safetensors.SafetensorError) as error:
         raise _damaged(path, str(error).splitlines()[0][:200]) from error
-    return _unflatten("params", params, leaves), _unflatten("model_state", state, leaves)
+    return _unflatten("params", params, leaves), _unflatten("model_state", model_state, leaves)
 
 
-def _flatten(params: PyTree, state: PyTree) -> dict[str, Any]:
-    trees = {"params": params, "model_state": state}
+def _flatten(params: PyTree, model_state: PyTree) -> dict[str, Any]:
+    trees = {"params": params, "model_state": model_state}
     return {
         prefix + name: leaf
         for prefix, tree in trees.items()

@@ -32,7 +32,7 @@ CGROUP_LIMITS = [
 ]
 NO_LIMIT = 2**60  # bytes; control groups print a huge number for "none"
 PROCESS_BYTES = 2600 * 2**20
-"""On a CPU, what a run takes whatever its size: imports, XLA while it compiles, MJX.
+"""Fixed memory of a run on a CPU: imports, XLA while it compiles, MJX.
 
 A `quick` run of cartpole peaks at 2.5 GiB (glibc's huge pages on), of which 0.1 are its
 state. Rounded up, since larger domains compile longer."""
@@ -95,7 +95,7 @@ class Estimate(NamedTuple):
 
 
 def estimate(state: PyTree, spec: EnvSpec, config: Config) -> tuple[Estimate, ...]:
-    """What a run takes of each memory; exact for its state, on the high side for the rest.
+    """Estimates the memory of a run: exact for its state, an upper estimate for the rest.
 
     Args:
       state: the `TrainState`; shapes and dtypes are enough.
@@ -129,7 +129,7 @@ def estimate(state: PyTree, spec: EnvSpec, config: Config) -> tuple[Estimate, ..
 
 
 def process_bytes() -> int:
-    """What a program takes of the first device's memory, whatever the run's size."""
+    """Fixed memory of a program on the first device."""
     return PROCESS_BYTES if jax.default_backend() == "cpu" else COMPILER_BYTES
 
 

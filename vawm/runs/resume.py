@@ -20,10 +20,20 @@ from vawm.runs.reports import tracking
 from vawm.types import PyTree
 
 MAY_DIFFER = (
-    *("env_steps", "log_every", "save_every", "save_minutes", "keep_checkpoints"),
-    *("video.every", "video.sequences", "video.context", "video.episode_steps"),
-    *("env.workers", "env.timeout", "env.on_failure"),
-    *("tracker", "tracker_project"),
+    "env_steps",
+    "log_every",
+    "save_every",
+    "save_minutes",
+    "keep_checkpoints",
+    "video.every",
+    "video.sequences",
+    "video.context",
+    "video.episode_steps",
+    "env.workers",
+    "env.timeout",
+    "env.on_failure",
+    "tracker",
+    "tracker_project",
 )
 """Fields that may differ: they change neither what a run learns nor what it has stored."""
 

@@ -181,7 +181,7 @@ def _check_agent(config: Config) -> None:
 
 
 def _check_names(config: Config) -> None:
-    """Preset and size are known, and a size is not the name of other widths than its own."""
+    """Preset and size are known, and the widths match the named size."""
     check_choice("preset", config.preset, [*registry.presets_of(config), CUSTOM])
     check_choice("size", config.size, [*registry.kind(config.agent).sizes, CUSTOM])
     if config.size == CUSTOM:
@@ -197,7 +197,7 @@ def _check_names(config: Config) -> None:
 
 
 def _check_project(name: str) -> None:
-    """What is a name of a project, and of a file, everywhere."""
+    """The tracker's project is a valid name of a file."""
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}", name):
         remedy = "use up to 100 letters, digits, '-', '_' and '.', a letter or digit first"
         raise InvalidInput("tracker_project", name, remedy)
@@ -208,7 +208,7 @@ def _check_imagination(config: Config) -> None:
     imagination = config.imagination
     from_contexts = imagination.starts == "contexts"
     if from_contexts and config.critic.replay_scale:
-        remedy = "use 0: its returns begin at posteriors, imagination at contexts"
+        remedy = "use 0: the replay value loss needs imagination.starts=posteriors"
         raise InvalidInput("critic.replay_scale", config.critic.replay_scale, remedy)
     if from_contexts and imagination.context_length > config.replay.batch_length:
         remedy = f"use at most replay.batch_length={config.replay.batch_length}"
@@ -259,7 +259,7 @@ def _usual(config: Config) -> Config:
 
 
 def _blame_batch(config: Config) -> None:
-    """Refuses a batch larger than the preset's for what replay gets to hold.
+    """Refuses a batch that is too large for the replay buffer and larger than the preset's.
 
     Raises:
       InvalidInput: with the largest batch that would do; not for a batch of usual size.
@@ -272,7 +272,7 @@ def _blame_batch(config: Config) -> None:
     largest = (held - replay.batch_length) * num_envs // replay.batch_length
     too_large = (
         f"a batch of {replay.batch_size} x {replay.batch_length} does not fit into the "
-        f"{held * num_envs} steps that replay gets to hold"
+        f"{held * num_envs} steps that replay will hold"
     )
     if largest < 1:
         remedy = f"{too_large}; use a smaller one"
@@ -283,7 +283,7 @@ def _blame_batch(config: Config) -> None:
 
 
 def _blame_envs(config: Config, needed: int) -> None:
-    """Refuses more environments than the preset's for what replay gets to hold of each.
+    """Refuses more environments than the preset's if replay holds too few steps of each.
 
     Raises:
       InvalidInput: with a number that would do; not for a usual number, nor if a single
@@ -296,7 +296,7 @@ def _blame_envs(config: Config, needed: int) -> None:
     if config.num_envs <= usual or enough < 1:
         return
     remedy = (
-        f"replay gets to hold {held // config.num_envs} steps of each and needs {needed}; "
+        f"replay will hold {held // config.num_envs} steps of each but needs {needed}; "
         f"use {enough}"
     )
     raise InvalidInput("num_envs", config.num_envs, remedy)
@@ -340,7 +340,7 @@ def check_spec(config: Config, spec: EnvSpec) -> None:
 
 
 def check_images(config: Config, *, present: bool) -> None:
-    """Refuses what only makes sense for images where observations have none.
+    """Refuses choices for images where there are no images.
 
     Raises:
       InvalidInput: replay is to keep images on the host, or videos are to be made.
@@ -359,7 +359,9 @@ def preset(agent: str, suite: str, name: str, size: str | None = None) -> Config
     """The config of a preset, at another size where one is given."""
     check_choice("agent", agent, registry.names())
     row = registry.kind(agent)
-    check_choice("suite", suite, row.presets)
+    if suite not in row.presets:
+        remedy = f"agent {agent} has no presets for it; use one of {', '.join(row.presets)}"
+        raise InvalidInput("suite", suite, suggestion(suite, row.presets) + remedy)
     known = row.presets[suite]
     check_choice("preset", name, known)
     if size is None:

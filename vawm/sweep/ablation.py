@@ -16,6 +16,7 @@ from typing import Literal, NamedTuple
 from vawm.agent import registry
 from vawm.analysis.tables import write_csv
 from vawm.cli import flags
+from vawm.config import AgentName
 from vawm.runs import suites, validate
 from vawm.sweep import children, figures, results, runs
 from vawm.sweep.runs import Sweep, Variant
@@ -92,7 +93,7 @@ class Compared:
 
     scale: Literal["quick", "paper"] = "quick"
     """quick: for a CPU with 2 cores; paper: the paper's tasks and presets, for a GPU"""
-    agent: str = "dreamerv3"
+    agent: AgentName = "dreamerv3"
     tasks: tuple[str, ...] = ()
     """one or more tasks; default those of the scale"""
     results: pathlib.Path = pathlib.Path("experiments/results")

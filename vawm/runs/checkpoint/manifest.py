@@ -32,8 +32,19 @@ PARAMS, EPISODES = "params", "episodes"
 ITEMS = (PARAMS, "model_state", "images", "state", EPISODES)
 """The folders of a checkpoint."""
 DTYPES = (
-    *("bool", "bfloat16", "float16", "float32", "float64"),
-    *("int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64"),
+    "bool",
+    "bfloat16",
+    "float16",
+    "float32",
+    "float64",
+    "int8",
+    "int16",
+    "int32",
+    "int64",
+    "uint8",
+    "uint16",
+    "uint32",
+    "uint64",
 )
 MAX_BYTES = 2**24
 """Limit for a manifest; a usual one has about 100 bytes per leaf and file."""

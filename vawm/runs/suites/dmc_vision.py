@@ -18,7 +18,7 @@ RENDERER_BYTES = 70 * 2**20
 
 
 def check(config: Config, env: VisionConfig) -> None:
-    """What the tasks from vectors refuse, and images of a size that no encoder takes.
+    """The checks of dmc_proprio, and the size of the images.
 
     Raises:
       InvalidInput: names the field and the remedy.

@@ -1,4 +1,4 @@
-"""What one has to say about a suite: the record that everything else looks up."""
+"""The record that defines a suite: the record that everything else looks up."""
 
 from __future__ import annotations
 
