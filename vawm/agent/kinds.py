@@ -44,9 +44,7 @@ def check_rssm(config: Config) -> None:
         remedy = f"use a multiple of world_model.blocks={model.blocks}"
         raise InvalidInput("world_model.deter", model.deter, remedy)
     if 4 * model.depth % model.blocks:  # channels of the map that the decoder starts from
-        remedy = (
-            f"use a depth whose fourfold is a multiple of world_model.blocks={model.blocks}"
-        )
+        remedy = f"make 4 * depth a multiple of world_model.blocks={model.blocks}"
         raise InvalidInput("world_model.depth", model.depth, remedy)
 
 
