@@ -19,10 +19,10 @@ def make(discrete):
     name = "memory_discrete" if discrete else "memory"
     spec = probes.make(name, num_envs=NUM_ENVS).spec
     agent = make_agent(tiny.CONFIG, spec)
-    params, state = agent.init(jax.random.key(0))
+    params, model_state = agent.init(jax.random.key(0))
     bias = params.actor["heads_0"]["bias"]
     params.actor["heads_0"]["bias"] = bias.at[-1].set(30.0)
-    return agent, params, state
+    return agent, params, model_state
 
 
 def waiting(agent, env_steps):
@@ -34,10 +34,10 @@ def waiting(agent, env_steps):
     return start._replace(env_steps=jnp.asarray(env_steps))
 
 
-def depart(agent, params, state, env_steps, *, random_steps=RANDOM_STEPS, seed=1):
+def depart(agent, params, model_state, env_steps, *, random_steps=RANDOM_STEPS, seed=1):
     key = jax.random.key(seed)
     after, stored = collector.depart(
-        agent, params, state, waiting(agent, env_steps), key, random_steps=random_steps
+        agent, params, model_state, waiting(agent, env_steps), key, random_steps=random_steps
     )
     action = np.asarray(stored.trajectory.action)
     np.testing.assert_array_equal(after.carry.action, action)  # what is remembered was done
@@ -45,8 +45,8 @@ def depart(agent, params, state, env_steps, *, random_steps=RANDOM_STEPS, seed=1
 
 
 def test_random_choices_are_one_hot_and_each_as_likely_as_any_other():
-    agent, params, state = make(discrete=True)
-    *_, action = depart(agent, params, state, RANDOM_STEPS - 1)
+    agent, params, model_state = make(discrete=True)
+    *_, action = depart(agent, params, model_state, RANDOM_STEPS - 1)
     np.testing.assert_array_equal(action[0], 0.0)  # nothing leaves from a last observation
     size = agent.spec.action_size
     np.testing.assert_array_equal(np.sort(action[1:], -1), np.eye(size)[[-1] * (NUM_ENVS - 1)])
@@ -55,8 +55,8 @@ def test_random_choices_are_one_hot_and_each_as_likely_as_any_other():
 
 
 def test_random_actions_are_uniform_between_minus_one_and_one():
-    agent, params, state = make(discrete=False)
-    *_, action = depart(agent, params, state, RANDOM_STEPS - 1)
+    agent, params, model_state = make(discrete=False)
+    *_, action = depart(agent, params, model_state, RANDOM_STEPS - 1)
     np.testing.assert_array_equal(action[0], 0.0)
     counts, _ = np.histogram(action[1:], bins=8, range=(-1, 1))
     assert counts.sum() == action[1:].size
@@ -66,14 +66,14 @@ def test_random_actions_are_uniform_between_minus_one_and_one():
 
 @pytest.mark.parametrize("discrete", [True, False])
 def test_random_actions_end_with_their_env_steps_and_are_not_the_policys(discrete):
-    agent, params, state = make(discrete)
-    before, other, random = depart(agent, params, state, RANDOM_STEPS - 1)
-    after, stored, chosen = depart(agent, params, state, RANDOM_STEPS)
+    agent, params, model_state = make(discrete)
+    before, other, random = depart(agent, params, model_state, RANDOM_STEPS - 1)
+    after, stored, chosen = depart(agent, params, model_state, RANDOM_STEPS)
     assert (random[1:] != chosen[1:]).any(-1).mean() > 0.3
     assert (chosen[1:, -1] > 0).mean() > 0.8  # what this policy wants
     carry, expected = agent.act(
         params,
-        state,
+        model_state,
         jax.random.split(jax.random.key(1))[0],
         waiting(agent, 0).carry,
         waiting(agent, 0).timestep,
@@ -89,17 +89,19 @@ def test_random_actions_end_with_their_env_steps_and_are_not_the_policys(discret
 
 @pytest.mark.parametrize("discrete", [True, False])
 def test_random_actions_differ_between_keys(discrete):
-    agent, params, state = make(discrete)
-    first, again, other = (depart(agent, params, state, 0, seed=seed)[-1] for seed in (1, 1, 2))
+    agent, params, model_state = make(discrete)
+    first, again, other = (
+        depart(agent, params, model_state, 0, seed=seed)[-1] for seed in (1, 1, 2)
+    )
     np.testing.assert_array_equal(first, again)
     assert (first[1:] != other[1:]).any(-1).mean() > 0.3
 
 
 def test_without_random_steps_the_policy_acts_from_the_first_on():
-    agent, params, state = make(discrete=True)
-    *_, action = depart(agent, params, state, 0, random_steps=0)
+    agent, params, model_state = make(discrete=True)
+    *_, action = depart(agent, params, model_state, 0, random_steps=0)
     start = waiting(agent, 0)
     _, expected = agent.act(
-        params, state, jax.random.key(1), start.carry, start.timestep, how="collect"
+        params, model_state, jax.random.key(1), start.carry, start.timestep, how="collect"
     )
     np.testing.assert_array_equal(action, expected)

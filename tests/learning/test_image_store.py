@@ -103,11 +103,12 @@ def test_what_is_read_is_a_copy():
     assert (read["picture"] == 0).all()
 
 
-def test_without_images_apart_observations_pass_as_they_are():
-    obs = {"a": jnp.ones(2)}
-    assert image_store.merge(obs, ()) is obs
-    batch = Batch(Trajectory(obs, *[None] * 5), ())
-    assert image_store.complete(batch, ()).trajectory.obs is obs
+def test_vectors_pass_as_they_are():
+    obs = jnp.ones((2, 3, 1)), jnp.zeros((2, 3, 0), jnp.uint8)
+    images = jnp.zeros((2, 3, 0)), jnp.ones((2, 3, 4, 4, 1), jnp.uint8)
+    batch = image_store.complete(Batch(Trajectory(obs, *[None] * 5), ()), images)
+    assert batch.trajectory.obs[0] is obs[0]
+    assert batch.trajectory.obs[1] is images[1]
 
 
 @pytest.mark.parametrize("steps", [3, 8])

@@ -99,7 +99,7 @@ def test_an_episode_that_a_reset_cut_short_ends_in_the_sample():
 
 
 def test_adding_more_steps_than_fit_is_refused():
-    with pytest.raises(ValueError, match="cannot add 8 steps to a buffer of 7"):
+    with pytest.raises(ValueError, match=r"8.*7"):
         filled(2, 7, [8])
 
 

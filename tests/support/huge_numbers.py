@@ -55,7 +55,8 @@ def learn_from_them(config):
 
     learner = init_learner(agent, config, jax.random.key(0))
     learner = learner._replace(params=noisy(learner.params))  # zeros would hide errors
-    batch, contexts = (shape and huge(agent, *shape) for shape in from_replay.shapes(config))
+    shapes = from_replay.shapes(config)
+    batch, contexts = from_replay.for_each(config, lambda shape: huge(agent, *shape), shapes)
     for number in range(UPDATES):
         learner, metrics, action = learn_and_act(
             learner, batch, contexts, jax.random.key(number)

@@ -1,7 +1,7 @@
-"""Interaction: act, store what the action left from, take in what arrives.
+"""Interaction with environments: act, store the step, take in what arrives.
 
-`depart` and `arrive` are the two halves of a step around an environment. `make_collect` puts
-a jittable environment between them; where environments run on the host, the host does.
+`depart` and `arrive` are the two halves of a step. `make_collect` calls a jittable environment
+between them; environments on the host are called by `vawm.learning.host_train`.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from vawm.types import Array, Key, Metrics, Params, PyTree, TimeStep, Trajectory
 
 
 class Collector(NamedTuple):
-    """Everything that interaction changes, but for replay."""
+    """Everything that interaction changes, except replay."""
 
     env_state: PyTree
-    timestep: TimeStep  # the observation that waits for an action
+    timestep: TimeStep  # what has arrived and needs an action
     carry: PolicyCarry
     env_steps: Array  # [] int32, control steps so far, action repeat included
     episode_return: Array  # [N] of the running episodes
@@ -33,7 +33,7 @@ class Collector(NamedTuple):
 
 
 class Departure(NamedTuple):
-    """What an action leaves behind: the step to store, and what is kept beside it."""
+    """The step to store once its action is chosen, and what replay keeps beside it."""
 
     trajectory: Trajectory  # [N, ...]
     latent: PyTree  # [N, ...]
@@ -45,23 +45,23 @@ Collect = Callable[[Params, PyTree, Collector, Replay, Key], tuple[Collector, Re
 def depart(
     agent: Agent,
     params: Params,
-    state: PyTree,
+    model_state: PyTree,
     collector: Collector,
     key: Key,
     *,
     random_steps: int,
 ) -> tuple[Collector, Departure]:
-    """Acts on what has arrived. The action, `[N, A]`, is that of the departure.
+    """Acts on what has arrived. The action `[N, A]` is in the returned step.
 
-    Before env step `random_steps` it is a random one instead.
+    Before env step `random_steps` it is a uniformly random action.
     """
-    timestep = collector.timestep
-    if random_steps:
+    timestep, carry = collector.timestep, collector.carry
+    if random_steps > 0:
         key, key_random = jax.random.split(key)
-        anything = agent.random_action(key_random, timestep)
-    carry, action = agent.act(params, state, key, collector.carry, timestep, how="collect")
-    if random_steps:
-        action = jnp.where(collector.env_steps < random_steps, anything, action)
+        random_action = agent.random_action(key_random, timestep)
+    carry, action = agent.act(params, model_state, key, carry, timestep, how="collect")
+    if random_steps > 0:
+        action = jnp.where(collector.env_steps < random_steps, random_action, action)
         carry = carry._replace(action=action)
     stored = Departure(
         Trajectory(*timestep, action=action), agent.world_model.memory(carry.memory)
@@ -72,10 +72,10 @@ def depart(
 def arrive(
     collector: Collector, timestep: TimeStep, *, action_repeat: int
 ) -> tuple[Collector, Metrics]:
-    """Takes in what an environment answered; `collector` has its new state already.
+    """Takes in what the environments returned; `collector` already has their new state.
 
-    Metrics are sums over the episodes that ended in this step, and `chunk/nonfinite`: for how
-    many environments what arrived, or the action before it, is not finite.
+    Metrics are sums over the episodes that ended in this step, and `chunk/nonfinite`: the
+    number of environments with NaN or infinity in what arrived, or in the action before it.
     """
     moved = ~timestep.is_first
     episode_return = jnp.where(moved, collector.episode_return, 0.0) + timestep.reward
@@ -99,23 +99,26 @@ def arrive(
 
 
 def is_finite(exchanged: PyTree) -> Array:
-    """Whether all numbers in arrays `[N, ...]` are, per environment, `[N]`."""
+    """Whether all numbers are finite, for each environment: `[N, ...]` arrays -> `[N]`."""
 
     def per_env(x: Array) -> Array:
         return jnp.isfinite(x).all(range(1, x.ndim))
 
     leaves = jax.tree.leaves(exchanged)
     floating = (x for x in leaves if jnp.issubdtype(x.dtype, jnp.floating))
-    anyway = jnp.ones(leaves[0].shape[0], bool)
-    return functools.reduce(jnp.logical_and, map(per_env, floating), anyway)
+    start = jnp.ones(leaves[0].shape[0], bool)
+    return functools.reduce(jnp.logical_and, map(per_env, floating), start)
 
 
 def make_collect(env: Environment, agent: Agent, config: Config) -> Collect:
-    """Build `collect(params, state, collector, replay, key)`: K steps in each environment."""
+    """Build `collect(params, model_state, collector, replay, key)`: K steps per environment.
 
-    def step(params: Params, state: PyTree, collector: Collector, key: Key):
+    It returns `(collector, replay, metrics)`, the metrics summed over the K steps.
+    """
+
+    def step(params: Params, model_state: PyTree, collector: Collector, key: Key):
         collector, stored = depart(
-            agent, params, state, collector, key, random_steps=config.random_steps
+            agent, params, model_state, collector, key, random_steps=config.random_steps
         )
         env_state, timestep = env.step(collector.env_state, stored.trajectory.action)
         collector, metrics = arrive(
@@ -126,10 +129,12 @@ def make_collect(env: Environment, agent: Agent, config: Config) -> Collect:
         metrics["env/nonfinite"] = jnp.sum(timestep.is_last & (env_state.steps < 0))
         return collector, (stored, metrics)
 
-    def collect(params: Params, state: PyTree, collector: Collector, buffer: Replay, key: Key):
+    def collect(
+        params: Params, model_state: PyTree, collector: Collector, buffer: Replay, key: Key
+    ) -> tuple[Collector, Replay, Metrics]:
         keys = jax.random.split(key, config.collect_steps)
         collector, (stored, metrics) = jax.lax.scan(
-            lambda c, k: step(params, state, c, k), collector, keys
+            lambda c, k: step(params, model_state, c, k), collector, keys
         )
         trajectory, latent = jax.tree.map(lambda x: x.swapaxes(0, 1), stored)
         buffer = replay.add(buffer, trajectory, latent)

@@ -1,4 +1,4 @@
-"""Learning from replay: as many updates as are due, each on what it draws."""
+"""Learning from replay: as many updates as are due, each on a batch of its own."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from vawm.learning import image_store, replay
 from vawm.learning.replay import Positions, Replay
 from vawm.learning.state import Learner
 from vawm.learning.update import make_update
-from vawm.types import Array, Key, Metrics, PyTree
+from vawm.types import Array, Batch, Key, Metrics
 
 
 class Draw(NamedTuple):
-    """One thing for the batch and the same for the contexts, `()` where there are none.
+    """The same kind of thing for the batch and for the contexts; `()` if there are none.
 
-    What it is: positions in replay, or the images there where replay has none itself.
+    Such as their shapes, their positions in replay, or their images if the host keeps those.
     """
 
     batch: Any
@@ -35,47 +35,61 @@ NO_IMAGES = Draw((), ())
 
 
 def shapes(config: Config) -> Draw:
-    """`(sequences, steps)` that an update draws; a batch has a first step for context."""
+    """`(sequences, steps)` of what an update draws; a batch has one more step, for context."""
     batch = config.replay.batch_size, config.replay.batch_length + 1
-    imagination = config.imagination
-    if imagination.starts != "contexts":
+    if not has_contexts(config):
         return Draw(batch, ())
-    return Draw(batch, (imagination.batch_size, imagination.context_length))
+    return Draw(batch, (config.imagination.batch_size, config.imagination.context_length))
+
+
+def has_contexts(config: Config) -> bool:
+    """Whether an update draws contexts of their own, in which imagination starts."""
+    return config.imagination.starts == "contexts"
+
+
+def for_each(config: Config, function: Callable[..., Any], *draws: Draw) -> Draw:
+    """`function` of the entries for the batch, and of those for the contexts, if any."""
+    batches = [draw.batch for draw in draws]
+    contexts = [draw.contexts for draw in draws]
+    return Draw(function(*batches), function(*contexts) if has_contexts(config) else ())
 
 
 def draw(config: Config, buffer: Replay, key: Key) -> Draw:
-    """Where an update's sequences lie, uniformly over all possible starts."""
-    batch, contexts = shapes(config)
-    if not contexts:
-        return Draw(_draw(buffer, key, *batch), ())
-    key_batch, key_contexts = jax.random.split(key)
-    return Draw(_draw(buffer, key_batch, *batch), _draw(buffer, key_contexts, *contexts))
+    """Positions of the sequences of an update, uniform over all possible starts."""
+    keys = Draw(key, ())
+    if has_contexts(config):
+        keys = Draw(*jax.random.split(key))
+
+    def positions(shape: tuple[int, int], key: Key) -> Positions:
+        batch_size, length = shape
+        return replay.draw(buffer, key, batch_size=batch_size, length=length)
+
+    return for_each(config, positions, shapes(config), keys)
 
 
 def draw_on_host(
     config: Config, rng: np.random.Generator, num_envs: int, capacity: int, head: int, size: int
 ) -> Draw:
-    """As `draw`, with numpy and where replay is known by its numbers only."""
+    """As `draw`, with numpy and without the arrays of replay."""
 
-    def positions(batch_size: int, length: int) -> Positions:
-        ring = num_envs, capacity, head, size
-        return replay.draw_on_host(rng, *ring, batch_size=batch_size, length=length)
+    def positions(shape: tuple[int, int]) -> Positions:
+        batch_size, length = shape
+        return replay.draw_on_host(
+            rng, num_envs, capacity, head, size, batch_size=batch_size, length=length
+        )
 
-    batch, contexts = shapes(config)
-    return Draw(positions(*batch), positions(*contexts) if contexts else ())
-
-
-def _draw(buffer: Replay, key: Key, batch_size: int, length: int) -> Positions:
-    return replay.draw(buffer, key, batch_size=batch_size, length=length)
+    return for_each(config, positions, shapes(config))
 
 
 def make_update_at(agent: Agent, config: Config) -> UpdateAt:
     """Build `update_at(learner, replay, positions, images, key, env_steps)`.
 
-    One update on what lies at `positions`, and the latents inferred there written back. Returns
-    learner, replay and metrics. `images` are those of the same steps where replay keeps none.
+    It makes one update with the steps at `positions` and writes the inferred latents back.
+    It returns learner, replay and metrics. `images` are those of the same steps if the host
+    keeps them, else `NO_IMAGES`.
     """
     update = make_update(agent, config)
+    on_host = config.replay.images == "host"
 
     def update_at(
         learner: Learner,
@@ -85,12 +99,13 @@ def make_update_at(agent: Agent, config: Config) -> UpdateAt:
         key: Key,
         env_steps: Array,
     ) -> tuple[Learner, Replay, Metrics]:
-        def read(at: Positions, images: PyTree):
-            return image_store.complete(replay.read(buffer, at), images)
+        def read(at: Positions) -> Batch:
+            return replay.read(buffer, at)
 
-        batch = read(positions.batch, images.batch)
-        contexts = positions.contexts and read(positions.contexts, images.contexts)
-        learner, latent, metrics = update(learner, batch, contexts, key, env_steps)
+        drawn = for_each(config, read, positions)
+        if on_host:
+            drawn = for_each(config, image_store.complete, drawn, images)
+        learner, latent, metrics = update(learner, drawn.batch, drawn.contexts, key, env_steps)
         inferred = positions.batch._replace(time=positions.batch.time[:, 1:])
         return learner, replay.write_back(buffer, inferred, latent), metrics
 
@@ -100,10 +115,10 @@ def make_update_at(agent: Agent, config: Config) -> UpdateAt:
 def make_learn(agent: Agent, config: Config) -> Learn:
     """Build `learn(learner, replay, key, env_steps, due) -> (learner, replay, metrics)`.
 
-    `due` updates, each on sequences of its own, whose latents are written back before the
-    next are drawn. Metrics are means over the updates, NaN if there is none.
+    It makes `due` updates, each on sequences of its own. Their latents are written back before
+    the next sequences are drawn. Metrics are means over the updates, NaN if there are none.
     """
-    # Jitted, so that asking for shapes is no second trace.
+    # Jitted, so that `eval_shape` and the loop share one trace.
     update_at = jax.jit(make_update_at(agent, config))
 
     def learn(

@@ -1,13 +1,13 @@
-"""The training step where environments run on the host: the same functions, in a plain loop.
+"""The training step for environments on the host: the same functions, in a Python loop.
 
     act, store            on the device
-    send the actions      the environments simulate from here on, in processes of their own
-    the updates due       on the device meanwhile; where images are kept on the host, the next
-                          batch is gathered and sent while the device still computes
+    send the actions      now the environments simulate, in processes of their own
+    the updates due       on the device at the same time; if the host keeps the images, it
+                          gathers and sends the next batch while the device still computes
     receive what arrives
 
-so every action is that of the newest parameters, and simulation costs nothing that an update
-hides. Updates are single calls, not a loop on the device: XLA's convolutions on CPU are 16
+So every action comes from the newest parameters, and updates hide the time of simulation.
+Updates are single calls, not a loop on the device, because XLA's convolutions on CPU are 16
 times slower inside a loop.
 """
 
@@ -35,10 +35,10 @@ HostStep = Callable[[TrainState], tuple[TrainState, dict[str, Any]]]
 
 
 class Compiled(NamedTuple):
-    """The three programs of a step, and the names of what `update` measures.
+    """The three programs of a step, and the names of the metrics of `update`.
 
     Attributes:
-      depart: `(params, state, collector, replay, key) -> (collector, replay, key,
+      depart: `(params, model_state, collector, replay, key) -> (collector, replay, key,
         key_learn)`.
       arrive: `(collector, timestep) -> (collector, metrics)`.
       update: `(learner, replay, positions, images, key_learn, number, env_steps) ->
@@ -52,7 +52,7 @@ class Compiled(NamedTuple):
 
 
 def init(agent: Agent, config: Config, key: Key, timestep: TimeStep) -> TrainState:
-    """The state before the first step, but for `images`; `timestep` are first observations."""
+    """The state before the first step, without `images`; `timestep` are first observations."""
     key, key_learner = jax.random.split(key)
     collector = begin(agent, timestep, (), num_envs=config.num_envs)
     stored = collector
@@ -69,7 +69,7 @@ def init(agent: Agent, config: Config, key: Key, timestep: TimeStep) -> TrainSta
 
 
 def first_timestep(spec: EnvSpec) -> TimeStep:
-    """Shapes and dtypes of what arrives from environments of `spec`."""
+    """Shapes and dtypes of what environments of `spec` return."""
 
     def of(shape: tuple[int, ...], dtype: Any) -> jax.ShapeDtypeStruct:
         return jax.ShapeDtypeStruct((spec.num_envs, *shape), dtype)
@@ -92,9 +92,9 @@ def compile_programs(
     *,
     kept: Callable[[str], bool] = lambda name: True,
 ) -> Compiled:
-    """Compiles the programs of a step for states like `state`; shapes are enough.
+    """Compiles the programs of a step for states like `state`, which may be shapes.
 
-    Of what `update` measures, only the names that are `kept` are computed.
+    Only metrics of `update` whose names are `kept` are computed.
     """
     key = jax.eval_shape(lambda: jax.random.key(0))
     positions = jax.eval_shape(lambda: _positions(config))
@@ -107,16 +107,13 @@ def compile_programs(
         return jax.jit(function, donate_argnums=donate).lower(*arguments).compile()
 
     update = _make_update(agent, config, kept)
-    arguments = learner, buffer, positions, images, key, number, number
+    to_depart = learner.params, learner.model_state, collector, buffer, key
+    to_update = learner, buffer, positions, images, key, number, number
     return Compiled(
-        depart=build(
-            _make_depart(agent, config),
-            (2, 3),
-            *(learner.params, learner.model_state, collector, buffer, key),
-        ),
+        depart=build(_make_depart(agent, config), (2, 3), *to_depart),
         arrive=build(_make_arrive(spec), (0,), collector, timestep),
-        update=build(update, (0, 1), *arguments),
-        metrics=tuple(jax.eval_shape(update, *arguments)[2]),
+        update=build(update, (0, 1), *to_update),
+        metrics=tuple(jax.eval_shape(update, *to_update)[2]),
     )
 
 
@@ -124,13 +121,13 @@ def make_step(env: HostEnvironment, config: Config, programs: Compiled) -> HostS
     """Build `step(state) -> (state, metrics)`: collect K steps, then learn.
 
     Counts, credit and metrics are those of `vawm.learning.train.make_train_step`, with
-    `env/restarts` for `env/nonfinite`: environments begun anew after a failure. An
-    update that hides a step of simulation does not wait for its count: what is warmed up by env
-    steps sees those of before that step. The state is used up: `images` is written in place,
-    the rest donated.
+    `env/restarts` in the place of `env/nonfinite`: the number of environments that failed and
+    were restarted. Updates do not wait for the step that is simulated at the same time, so
+    warm-ups that count env steps do not count it yet. The state that is passed cannot be used
+    again: `images` is written in place, the rest is donated.
 
     Raises:
-      EnvironmentFailure: in `step`, when an environment fails and may not be restarted.
+      EnvironmentFailure: in `step`, if an environment fails and must not be restarted.
     """
     run_updates = _make_updates(env.spec, config, programs.update)
     on_host = config.replay.images == "host"
@@ -138,7 +135,7 @@ def make_step(env: HostEnvironment, config: Config, programs: Compiled) -> HostS
     def step(state: TrainState) -> tuple[TrainState, dict[str, Any]]:
         learner, collector, buffer, credit, key, images = state
         restarts, arrived = env.restarts, []
-        for left in reversed(range(config.collect_steps)):
+        for number in range(config.collect_steps):
             if on_host:
                 pending = jax.device_get(collector.timestep.obs)
                 image_store.add(images, pending, at=int(buffer.head))
@@ -146,7 +143,7 @@ def make_step(env: HostEnvironment, config: Config, programs: Compiled) -> HostS
                 learner.params, learner.model_state, collector, buffer, key
             )
             env.send(np.asarray(collector.carry.action))
-            if not left:
+            if number == config.collect_steps - 1:
                 learner, buffer, credit, learned = run_updates(
                     learner, buffer, images, credit, key_learn, collector.env_steps
                 )
@@ -166,8 +163,8 @@ def make_step(env: HostEnvironment, config: Config, programs: Compiled) -> HostS
 def _make_updates(spec: EnvSpec, config: Config, update: Callable) -> Callable:
     """Build `run_updates(learner, replay, images, credit, key, env_steps)`: the updates due.
 
-    Batches are drawn with numpy, from the seed and the number of the update alone, so that
-    no draw waits for the device.
+    Batches are drawn with numpy and depend only on the seed and the number of the update, so
+    that no draw waits for the device.
     """
     length, batch_steps = config.replay.batch_length, config.replay.batch_steps
     earned = config.collect_steps * config.num_envs * config.train_ratio
@@ -186,17 +183,20 @@ def _make_updates(spec: EnvSpec, config: Config, update: Callable) -> Callable:
         ready = spec.num_envs * (size - length) >= batch_steps
         owed = int(credit) + (earned if ready else 0)
         learned = []
+
+        def read(positions: replay.Positions) -> PyTree:
+            return image_store.read(images, positions)
+
         for number in range(owed // batch_steps):
             rng = np.random.default_rng((config.seed, done + number))
-            ring = spec.num_envs, capacity, head, size
-            positions = from_replay.draw_on_host(config, rng, *ring)
+            positions = from_replay.draw_on_host(
+                config, rng, spec.num_envs, capacity, head, size
+            )
             pictures = from_replay.NO_IMAGES
             if on_host:
-                pictures = from_replay.Draw(
-                    *(at and image_store.read(images, at) for at in positions)
-                )
+                pictures = from_replay.for_each(config, read, positions)
             learner, buffer, metrics = update(
-                *(learner, buffer, positions, pictures, key, np.int32(number), env_steps)
+                learner, buffer, positions, pictures, key, np.int32(number), env_steps
             )
             learned.append(metrics)
         return learner, buffer, np.int32(owed % batch_steps), learned
@@ -206,11 +206,11 @@ def _make_updates(spec: EnvSpec, config: Config, update: Callable) -> Callable:
 
 def _make_depart(agent: Agent, config: Config) -> Callable:
     def depart_and_store(
-        params: Params, state: PyTree, collector: Collector, buffer: Replay, key: Key
+        params: Params, model_state: PyTree, collector: Collector, buffer: Replay, key: Key
     ):
         key, key_act, key_learn = jax.random.split(key, 3)
         collector, stored = depart(
-            agent, params, state, collector, key_act, random_steps=config.random_steps
+            agent, params, model_state, collector, key_act, random_steps=config.random_steps
         )
         if config.replay.images == "host":
             obs = image_store.without_images(stored.trajectory.obs)
@@ -240,14 +240,16 @@ def _make_update(agent: Agent, config: Config, kept: Callable[[str], bool]) -> C
 
 
 def _positions(config: Config) -> from_replay.Draw:
+    """Positions of the shapes and dtypes that a draw has."""
+
     def at(shape: tuple[int, int]) -> replay.Positions:
         return replay.Positions(jnp.zeros(shape[0], jnp.int32), jnp.zeros(shape, jnp.int32))
 
-    return from_replay.Draw(*(shape and at(shape) for shape in from_replay.shapes(config)))
+    return from_replay.for_each(config, at, from_replay.shapes(config))
 
 
 def _images(spec: EnvSpec, config: Config) -> from_replay.Draw:
-    """What `image_store.read` returns for a draw; `()` where replay has the images."""
+    """Images of the shapes and dtypes that a draw has; `NO_IMAGES` if replay keeps them."""
     if config.replay.images == "device":
         return from_replay.NO_IMAGES
 
@@ -256,11 +258,11 @@ def _images(spec: EnvSpec, config: Config) -> from_replay.Draw:
         empty = jax.tree.map(lambda x: jnp.zeros((*shape, 0), x.dtype), spec.obs)
         return image_store.merge(empty, whole)
 
-    return from_replay.Draw(*(shape and images(shape) for shape in from_replay.shapes(config)))
+    return from_replay.for_each(config, images, from_replay.shapes(config))
 
 
 def _mean(learned: list[Metrics], names: tuple[str, ...]) -> dict[str, float]:
-    """Means over the updates of a chunk; NaN where there were none."""
-    if not learned:
+    """Means over the updates of a chunk; NaN if there were none."""
+    if len(learned) == 0:
         return dict.fromkeys(names, math.nan)
     return {name: float(np.mean([m[name] for m in learned])) for name in names}

@@ -1,8 +1,8 @@
-"""Replayed images in host memory, where a device has too little: the same ring, as bytes.
+"""Replayed images in the memory of the host, for devices that have too little of it.
 
-Replay on the device then holds everything but the images, with an empty array in the place
-of each; the store holds the images alone, with an empty array in the place of each vector.
-Both have the tree of an observation, so together they are whole again.
+The store is a ring like replay, of bytes. Replay on the device then holds everything except the
+images, with an empty array in the place of each image; the store holds only the images, with an
+empty array in the place of each vector. Both are trees like an observation; `merge` joins them.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ def init(obs: PyTree, *, num_envs: int, capacity: int) -> PyTree:
 
 
 def add(store: PyTree, obs: PyTree, at: int) -> None:
-    """Writes the images of one step, `[N, ...]`, in place: at index `at` of every ring."""
+    """Writes the images of one step, `[N, ...]`, to index `at` of every ring, in place."""
     for ring, x in zip(jax.tree.leaves(store), jax.tree.leaves(obs), strict=True):
         if ring.size:
             ring[:, at] = x
 
 
 def read(store: PyTree, positions: Positions) -> PyTree:
-    """The images at `positions`, `[B, L, ...]`, copied."""
+    """A copy of the images at `positions`, `[B, L, ...]`."""
     env, time = positions
 
     def gather(ring: np.ndarray) -> np.ndarray:
@@ -50,20 +50,18 @@ def read(store: PyTree, positions: Positions) -> PyTree:
 
 
 def without_images(obs: PyTree) -> PyTree:
-    """`[N, ...]` observations with an empty array in the place of each image."""
+    """Observations `[N, ...]` with an empty array in the place of each image."""
     return jax.tree.map(
         lambda x: jnp.zeros((x.shape[0], 0), x.dtype) if is_image(x) else x, obs
     )
 
 
 def merge(obs: PyTree, images: PyTree) -> PyTree:
-    """The inverse of taking a tree apart; without `images`, `()`, the observations it is."""
-    if isinstance(images, tuple):
-        return obs
+    """Observations whose images are taken from the tree `images`."""
     return jax.tree.map(lambda x, pixels: pixels if is_image(x) else x, obs, images)
 
 
 def complete(batch: Batch, images: PyTree) -> Batch:
-    """`batch` with the images of its steps; `()` where replay had them."""
+    """`batch` with the `images` of its steps."""
     obs = merge(batch.trajectory.obs, images)
     return batch._replace(trajectory=batch.trajectory._replace(obs=obs))

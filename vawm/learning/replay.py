@@ -1,10 +1,10 @@
 """A ring buffer of experience that lives on the device.
 
-Every leaf is `[N, C, ...]`: N streams, one per environment, of C steps each. A sample is
-a run of consecutive steps of one stream, free to cross episode ends, never the write
-head. Beside each step lies what the world model wants to remember of it, such as the latent
-inferred there (`WorldModel.memory`), or `()`; a sample starts from that at its first step, and
-the learner writes back what it infers.
+Every leaf is `[N, C, ...]`: N streams, one per environment, of C steps each. A sample is a run
+of consecutive steps of one stream. It may cross the end of an episode, but never the write
+head. Beside each step, replay keeps what the world model remembers there (`WorldModel.memory`),
+such as the inferred latent, or `()`. A sample starts from what is kept beside its first step,
+and updates write back what they infer.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from vawm.types import Array, Batch, EnvSpec, Key, PyTree, Trajectory
 
 class Replay(NamedTuple):
     trajectory: Trajectory  # [N, C, ...]
-    latent: PyTree  # [N, C, ...] what is remembered beside a step
+    latent: PyTree  # [N, C, ...] what is kept beside a step
     head: Array  # [] int32, where the next step is written
     size: Array  # [] int32, steps held in each stream
 
 
 class Positions(NamedTuple):
-    """Where a sample lies; of jax or of numpy, by who drew it."""
+    """Where a sample is: arrays of jax or of numpy."""
 
     env: Any  # [B] int32
     time: Any  # [B, L] int32
@@ -41,10 +41,10 @@ def capacity_per_env(
       capacity: steps of all environments together.
       spec: of the environment; every full episode adds a reset to its control steps.
       env_steps: control steps of the run.
-      collect_steps: K, the run collects in chunks of so many steps.
+      collect_steps: K, the number of steps in a chunk; a run collects whole chunks.
     """
     calls = -(-env_steps // (spec.num_envs * spec.action_repeat))
-    resets = calls // spec.episode_length + 1 if spec.episode_length else 0
+    resets = 0 if spec.episode_length is None else calls // spec.episode_length + 1
     collected = -(-(calls + resets) // collect_steps) * collect_steps
     return max(1, min(capacity // spec.num_envs, collected))
 
@@ -83,13 +83,13 @@ def add(replay: Replay, trajectory: Trajectory, latent: PyTree) -> Replay:
 
 
 def num_starts(replay: Replay, length: int) -> Array:
-    """In how many places, over all streams, a sample of `length` steps can begin."""
+    """The number of places, in all streams, where a sample of `length` steps can start."""
     num_envs = replay.trajectory.reward.shape[0]
     return num_envs * jnp.maximum(replay.size - length + 1, 0)
 
 
 def draw(replay: Replay, key: Key, *, batch_size: int, length: int) -> Positions:
-    """`batch_size` runs of `length` steps, uniformly over all possible starts.
+    """`batch_size` runs of `length` steps, uniform over all possible starts.
 
     Needs `num_starts(replay, length) > 0`.
     """
@@ -112,7 +112,7 @@ def draw_on_host(
     batch_size: int,
     length: int,
 ) -> Positions:
-    """As `draw`, with numpy and where replay is known by its numbers only."""
+    """As `draw`, with numpy and without the arrays of replay."""
     env = rng.integers(num_envs, size=batch_size)
     start = rng.integers(size - length + 1, size=batch_size)
     time = (head - size + start[:, None] + np.arange(length)[None, :]) % capacity
@@ -120,18 +120,18 @@ def draw_on_host(
 
 
 def read(replay: Replay, positions: Positions) -> Batch:
-    """What lies at `positions`: `[B, L, ...]`, and what is kept beside their first steps."""
+    """The steps at `positions`, `[B, L, ...]`, and what is kept beside the first of each."""
     env, time = positions
     trajectory = jax.tree.map(lambda x: x[env[:, None], time], replay.trajectory)
     context = jax.tree.map(lambda x: x[env, time[:, 0]], replay.latent)
-    # An episode that a reset cut short has no last step of its own.
+    # An episode that a reset cuts short has no `is_last` of its own.
     abandoned = jnp.pad(trajectory.is_first[:, 1:], ((0, 0), (0, 1)))
     trajectory = trajectory._replace(is_last=trajectory.is_last | abandoned)
     return Batch(trajectory, context)
 
 
 def write_back(replay: Replay, positions: Positions, latent: PyTree) -> Replay:
-    """Replace what is kept at `positions` by something newer, `[B, L, ...]`."""
+    """Replaces what is kept beside the steps at `positions` by `latent`, `[B, L, ...]`."""
 
     def write(buffer, x):
         return buffer.at[positions.env[:, None], positions.time].set(x.astype(buffer.dtype))

@@ -2,7 +2,7 @@
 
 `make_train_step` joins interaction (`vawm.learning.collector`) and learning
 (`vawm.learning.update`). Nothing here is jitted; the caller compiles `train_step` once and
-donates its state. Where environments run on the host, `vawm.learning.host_train` takes its
+donates its state. For environments that run on the host, `vawm.learning.host_train` takes its
 place.
 """
 
@@ -26,14 +26,14 @@ from vawm.types import Array, Key, Metrics, PyTree, Trajectory
 
 
 class TrainState(NamedTuple):
-    """A whole run: what a checkpoint holds and `train_step` maps to its successor."""
+    """The whole state of a run: what a checkpoint holds, and what `train_step` advances."""
 
     learner: Learner
     collector: Collector
     replay: Replay
-    credit: Array  # [] int32, replayed steps that are owed, less than one batch
+    credit: Array  # [] int32, steps that are still to be replayed, less than one batch
     key: Key
-    images: PyTree = ()  # replayed images where the host keeps them: `learning.image_store`
+    images: PyTree = ()  # replayed images if the host keeps them: `learning.image_store`
 
 
 Init = Callable[[Key], TrainState]
@@ -43,15 +43,16 @@ TrainStep = Callable[[TrainState], tuple[TrainState, Metrics]]
 def make_train_step(env: Environment, agent: Agent, config: Config) -> TrainStep:
     """Build `train_step(state) -> (state, metrics)`: collect K steps, then learn.
 
-    Every collected step of every environment owes `train_ratio` replayed steps; an update
-    replays batch_size * batch_length. From the first chunk on after which replay can fill
-    a batch with different sequences, the updates due run at once and the remainder is
-    carried over, so that their number is exactly
+    Every collected step of every environment earns `train_ratio` replayed steps; an update
+    replays batch_size * batch_length. Earning starts with the first chunk after which replay
+    can fill a batch with different sequences. The updates that are due run after each chunk,
+    and the remainder is carried over, so that their number is exactly
     `floor(collected steps * train_ratio / (batch_size * batch_length))`.
 
-    Metrics: counters `env_steps`, `updates` (so far), `chunk/updates`, `chunk/nonfinite` (of
-    what environments return, and of actions), sums over finished episodes `episode/*`,
-    `env/nonfinite`, and means over this chunk's updates of the rest (NaN when there was none).
+    Metrics: the counters `env_steps`, `updates` (so far), `chunk/updates` and `chunk/nonfinite`
+    (of what environments return, and of actions); sums over finished episodes, `episode/*` and
+    `env/nonfinite`; and means of the rest over the updates of this chunk (NaN if there were
+    none).
     """
     collect = make_collect(env, agent, config)
     learn = make_learn(agent, config)
@@ -106,7 +107,7 @@ def init(env: Environment, agent: Agent, config: Config, key: Key) -> TrainState
 
 
 def empty_replay(agent: Agent, collector: Collector, config: Config) -> Replay:
-    """Replay for what `collector` will store; never more than the run collects."""
+    """Empty replay for the steps of `collector`; never larger than what the run collects."""
     example = Trajectory(*collector.timestep, action=collector.carry.action)
     capacity = replay.capacity_per_env(
         config.replay.capacity,
@@ -126,15 +127,15 @@ SEED_AXES = TrainState(
     key=0,  # type: ignore[arg-type]
     images=None,
 )
-"""Which leaves of a `TrainState` stack over seeds.
+"""Which leaves of a `TrainState` are stacked over seeds.
 
-How full replay is and what is owed follow from the number of chunks alone. Shared, they
-give the loop of updates one trip count; stacked, the loop would have to select between
-the old and the new replay of every seed after every update."""
+How full replay is, and how many updates are due, depends only on the number of chunks. As
+shared values they give the loop of updates one trip count. Stacked, the loop would have to
+select between the old and the new replay of every seed after every update."""
 
 
 def over_seeds(init: Init, train_step: TrainStep) -> tuple[Init, TrainStep]:
-    """`init` over keys `[S]` and `train_step` over its states, all seeds side by side."""
+    """`init` for keys `[S]`, and `train_step` for all S seeds at once."""
     return (
         jax.vmap(init, out_axes=SEED_AXES),
         jax.vmap(train_step, in_axes=(SEED_AXES,), out_axes=(SEED_AXES, 0)),

@@ -54,8 +54,10 @@ def make(trainer: Trainer, config: Config) -> Callable[[TrainState], list[Video]
     look_up = jax.jit(lambda buffer, at: replay.read(buffer, at))
 
     def look(state: TrainState, positions: Positions) -> Batch:
-        images = image_store.read(state.images, positions) if on_host else ()
-        return image_store.complete(look_up(state.replay, positions), images)
+        batch = look_up(state.replay, positions)
+        if not on_host:
+            return batch
+        return image_store.complete(batch, image_store.read(state.images, positions))
 
     def film(state: TrainState) -> list[Video]:
         learner, buffer = state.learner, state.replay
