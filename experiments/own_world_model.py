@@ -5,8 +5,9 @@
     python experiments/own_world_model.py --logdir LOGDIR --resume
     python -m vawm.evaluate --plugin experiments/own_world_model.py --logdir LOGDIR
 
-A world model is nine pure functions, `vawm.world_model.protocol.WorldModel`. This one is a
-plain GRU with categorical latents and the heads of DreamerV3:
+A world model is nine pure functions, `vawm.world_model.protocol.WorldModel`; a recurrent one
+needs only a cell, `vawm.world_model.recurrent`, and heads. This one is a plain GRU with
+categorical latents between the heads of DreamerV3:
 
     h_t = GRU(h_{t-1}, [z_{t-1}, a_{t-1}]),  z_t ~ q(z | h_t, o_t),  z~_t ~ p(z | h_t)
 """
@@ -28,16 +29,13 @@ from vawm.nets import distributions
 from vawm.process import huge_pages
 from vawm.types import (
     EnvSpec,
-    Explanation,
     Inference,
     Latent,
-    Predictions,
-    Targets,
-    features,
     flat_stoch,
 )
 from vawm.world_model.heads import make_heads
 from vawm.world_model.protocol import WorldModel
+from vawm.world_model.recurrent import Cell, recurrent
 
 
 @dataclass(frozen=True)
@@ -53,105 +51,61 @@ class GRUConfig(HeadsConfig):
 
 
 def gru(config: GRUConfig, spec: EnvSpec, *, dtype, noise) -> WorldModel:
-    """Builds the pure functions; `noise` says whether z~ shares the noise of z."""
+    """The cell of the model, between the heads; `noise` says whether z~ shares that of z."""
     heads = make_heads(config, spec, dtype)
     width = config.stoch * config.classes
-    cell, dense = linen.GRUCell(config.deter), linen.Dense(width)
+    net = linen.GRUCell(config.deter, dtype=dtype)
+    dense = linen.Dense(width)  # logits are float32
 
     def init(key):
-        keys = jax.random.split(key, 4)
+        keys = jax.random.split(key, 3)
         deter, tokens = jnp.zeros(config.deter), jnp.zeros(heads.token_size)
-        params, model_state = heads.init(keys[0])
-        params["cell"] = cell.init(keys[1], deter, jnp.zeros(width + spec.action_size))
-        params["prior"] = dense.init(keys[2], deter)
-        params["post"] = dense.init(keys[3], jnp.concatenate([deter, tokens]))
-        return params, model_state
-
-    def initial(batch_size):
-        stoch = jnp.zeros((batch_size, config.stoch, config.classes))
-        return Latent(jnp.zeros((batch_size, config.deter)), stoch)
+        return {
+            "cell": net.init(keys[0], deter, jnp.zeros(width + spec.action_size)),
+            "prior": dense.init(keys[1], deter),
+            "post": dense.init(keys[2], jnp.concatenate([deter, tokens])),
+        }
 
     def advance(params, latent, action):
         inputs = jnp.concatenate([flat_stoch(latent.stoch), action], axis=-1)
-        return cell.apply(params["cell"], latent.deter, inputs)[0]
+        return net.apply(params["cell"], latent.deter, inputs)[0]
 
-    def logits(params, inputs):
-        return jnp.asarray(dense.apply(params, inputs)).reshape(
-            -1, config.stoch, config.classes
-        )
+    def logits(params, *inputs):
+        flat = jnp.asarray(dense.apply(params, jnp.concatenate(inputs, axis=-1)))
+        return flat.reshape(*flat.shape[:-1], config.stoch, config.classes)
 
-    def sample(key, logits):
-        uniform = jax.random.uniform(key, logits.shape[:-1])
-        return distributions.sample_one_hot(logits, uniform, unimix=config.unimix)
+    def sample(uniform, logits):
+        return distributions.sample_one_hot(logits, uniform, unimix=config.unimix).astype(dtype)
 
     def observe(params, key, latent, tokens, prev_action, is_first):
-        """One step of `[N, ...]`: everything is zero before the first step of an episode."""
-        keep = 1.0 - is_first[:, None]
-        latent = Latent(latent.deter * keep, latent.stoch * keep[..., None])
-        deter = advance(params, latent, prev_action * keep)
-        post = logits(params["post"], jnp.concatenate([deter, tokens], axis=-1))
-        prior = logits(params["prior"], deter)
-        key_post, key_prior = jax.random.split(key)
-        predicted = sample(key_post if noise == "shared" else key_prior, prior)
-        return Inference(
-            Latent(deter, sample(key_post, post)), Latent(deter, predicted), post, prior
-        )
-
-    def observe_batch(params, model_state, key, batch):
-        """Steps 1..T of a batch, `[B, T, ...]`; action t - 1 led to observation t."""
-        time_major = jax.tree.map(lambda x: x.swapaxes(0, 1), batch.trajectory)
-        obs, is_first = jax.tree.map(lambda x: x[1:], (time_major.obs, time_major.is_first))
-        tokens, _ = heads.encode(params, model_state, obs)  # all at once, outside of the scan
-
         def step(latent, inputs):
-            key, *arrived = inputs
-            inference = observe(params, key, latent, *arrived)
-            return inference.latent, inference
+            uniform, tokens, prev_action, is_first = inputs
+            keep = 1 - is_first.astype(dtype)[:, None]  # an episode starts with zeros
+            latent = Latent(latent.deter * keep, latent.stoch * keep[..., None])
+            deter = advance(params, latent, prev_action * keep)
+            post = logits(params["post"], deter, tokens)
+            latent = Latent(deter, sample(uniform, post))
+            return latent, (latent, post)
 
-        keys = jax.random.split(key, len(is_first))
-        inputs = keys, tokens, time_major.action[:-1], is_first
-        _, inference = jax.lax.scan(step, batch.context, inputs)
-        return jax.tree.map(lambda x: x.swapaxes(0, 1), inference)
+        key_post, key_prior = jax.random.split(key)
+        uniform = jax.random.uniform(key_post, (*is_first.shape, config.stoch))
+        inputs = uniform, tokens, prev_action, is_first
+        _, (latent, post) = jax.lax.scan(step, latent, inputs)
+        prior = logits(params["prior"], latent.deter)
+        if noise == "independent":
+            uniform = jax.random.uniform(key_prior, uniform.shape)
+        return Inference(latent, Latent(latent.deter, sample(uniform, prior)), post, prior)
 
-    def filter_step(params, model_state, key, latent, obs, prev_action, is_first):
-        tokens, _ = heads.encode(params, model_state, obs)
-        latent = observe(params, key, latent, tokens, prev_action, is_first).latent
-        return latent, latent
-
-    def explain(params, model_state, key, batch):
-        inference = observe_batch(params, model_state, key, batch)
-        steps = jax.tree.map(lambda x: x[:, 1:], batch.trajectory)
-        targets = Targets(steps.obs, steps.reward, steps.is_terminal)
-        predictions = predict(params, model_state, inference.latent)
-        return Explanation(inference, predictions, targets), model_state
-
-    def starts(params, model_state, inference):
-        latent = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), inference.latent)
-        latent = jax.lax.stop_gradient(latent)
-        return latent, latent
-
-    def follow(params, model_state, key, batch, *, horizon):
-        key_observe, key_imagine = jax.random.split(key)
-        latent = observe_batch(params, model_state, key_observe, batch).latent
-        last = jax.tree.map(lambda x: x[:, -1], latent)
-        action = batch.trajectory.action[:, -1]
-        return latent, imagine(params, model_state, key_imagine, last, action)
-
-    def imagine(params, model_state, key, latent, action):
-        deter = advance(params, latent, action)
-        latent = Latent(deter, sample(key, logits(params["prior"], deter)))
-        return latent, latent
-
-    def predict(params, model_state, latent):
-        obs, _ = heads.decode(params, model_state, features(latent))
-        return Predictions(obs, *heads.outcome(params, features(latent)))
-
-    def memory(latent):
+    def begin(params, latent):
         return latent
 
-    return WorldModel(
-        init, initial, memory, filter_step, explain, starts, follow, imagine, predict
-    )
+    def imagine(params, key, latent, action):
+        deter = advance(params, latent, action)
+        prior = logits(params["prior"], deter)
+        latent = Latent(deter, sample(jax.random.uniform(key, prior.shape[:-1]), prior))
+        return latent, latent
+
+    return recurrent(Cell(init, observe, begin, imagine), heads, config, dtype=dtype)
 
 
 vawm.agent.register("gru", GRUConfig, gru)

@@ -7,17 +7,20 @@ import pathlib
 import sys
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import tiny
+import toy_batch
 from analysis_records import make_episodes
 
 import vawm
 from vawm import evaluate, export
-from vawm.agent import registry
+from vawm.agent import Agent, make_agent, registry
 from vawm.analysis import values
 from vawm.cli import command_line
 from vawm.envs import probes
+from vawm.learning import train
 from vawm.runs import runner
 from vawm.sweep import runs
 from vawm.sweep.runs import Sweep, Variant
@@ -70,6 +73,33 @@ def test_a_run_that_was_resumed_equals_one_in_one_piece(config, logdir, tmp_path
     runner.run(config, tmp_path / "whole", env=tiny.env())
     one, two = vawm.load(tmp_path / "whole"), vawm.load(logdir)
     jax.tree.map(np.testing.assert_array_equal, one.params, two.params)
+
+
+@pytest.mark.parametrize("noise", ["independent", "shared"])
+def test_it_can_be_traced_in_half_precision_as_on_a_gpu(config, noise):
+    config = dataclasses.replace(
+        config,
+        compute_dtype="bfloat16",
+        value_alignment=dataclasses.replace(config.value_alignment, noise=noise),
+    )
+    env = tiny.env()
+    agent = make_agent(config, env.spec)
+    state = jax.eval_shape(lambda k: train.init(env, agent, config, k), jax.random.key(0))
+    after, _ = jax.eval_shape(train.make_train_step(env, agent, config), state)
+    assert after == state
+
+
+def test_with_shared_noise_equal_distributions_give_equal_samples(config, own):
+    world_model = own.gru(
+        config.world_model, tiny.env().spec, dtype=jnp.float32, noise="shared"
+    )
+    params, model_state = world_model.init(jax.random.key(0))
+    params["prior"] = jax.tree.map(jnp.zeros_like, params["prior"])
+    params["post"] = jax.tree.map(jnp.zeros_like, params["post"])
+    batch = toy_batch.batch(Agent(tiny.env().spec, world_model, None, None))
+    explanation, _ = world_model.explain(params, model_state, jax.random.key(1), batch)
+    inference = explanation.inference
+    np.testing.assert_array_equal(inference.latent.stoch, inference.prior_latent.stoch)
 
 
 def test_it_is_evaluated_and_exported(logdir, tmp_path):

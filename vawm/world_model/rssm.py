@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from typing import Literal
 
 import jax
@@ -13,21 +12,16 @@ from vawm.config import RSSMConfig
 from vawm.nets import distributions
 from vawm.types import (
     Array,
-    Batch,
     EnvSpec,
-    Explanation,
     Inference,
     Key,
     Latent,
-    Predictions,
     PyTree,
-    Targets,
-    features,
     flat_stoch,
 )
 from vawm.world_model.heads import make_heads
-from vawm.world_model.packing import pack, unpack
 from vawm.world_model.protocol import Imagination, WorldModel
+from vawm.world_model.recurrent import Cell, recurrent
 
 
 def network(config: RSSMConfig, *, actions: int, tokens: int, dtype: jnp.dtype) -> nets.RSSM:
@@ -45,19 +39,6 @@ def network(config: RSSMConfig, *, actions: int, tokens: int, dtype: jnp.dtype) 
     )
 
 
-def blank(config: RSSMConfig, batch_size: int, *, dtype: jnp.dtype) -> Latent:
-    """The latents before the first observation: all zero."""
-    return Latent(
-        jnp.zeros((batch_size, config.deter), dtype),
-        jnp.zeros((batch_size, config.stoch, config.classes), dtype),
-    )
-
-
-def swap_time(tree: PyTree) -> PyTree:
-    """`[B, T, ...]` -> `[T, B, ...]`, and back."""
-    return jax.tree.map(lambda x: x.swapaxes(0, 1), tree)
-
-
 def rssm(
     config: RSSMConfig,
     spec: EnvSpec,
@@ -70,11 +51,10 @@ def rssm(
 
         h_t = f(h_{t-1}, z_{t-1}, a_{t-1}),  z_t ~ q(z | h_t, o_t),  z~_t ~ p(z | h_t)
 
-    If deterministic, z and z~ are the probabilities of q and p instead of samples. The model
-    remembers the `Latent` s_{t-1}, which replay keeps beside every step. Everything that needs
-    no recurrence (the encoder, the share of the action and of the observation in their layers,
-    the prior) is computed for all time steps at once; only the rest is in the scan.
-    `model_state` has no arrays, and training and acting are the same.
+    If deterministic, z and z~ are the probabilities of q and p instead of samples. Everything
+    that needs no recurrence (the encoder, the share of the action and of the observation in
+    their layers, the prior) is computed for all time steps at once; only the rest is in the
+    scan. `model_state` has no arrays, and training and acting are the same.
 
     Args:
       config: widths and layers.
@@ -95,37 +75,24 @@ def rssm(
             return distributions.probabilities(logits, unimix=config.unimix).astype(dtype)
         return distributions.sample_one_hot(logits, uniform, unimix=config.unimix).astype(dtype)
 
-    def remember(latent: Latent) -> Latent:
-        return latent if deterministic else pack(latent)
-
-    def recall(context: Latent) -> Latent:
-        return context if deterministic else unpack(context, config.classes)
-
-    def init(key: Key) -> tuple[PyTree, PyTree]:
-        key_rssm, key_heads = jax.random.split(key)
+    def init(key: Key) -> dict[str, PyTree]:
         widths = config.deter, config.stoch * config.classes, spec.action_size, heads.token_size
-        params = net.init(key_rssm, *(jnp.zeros((1, width), dtype) for width in widths))
-        head_params, model_state = heads.init(key_heads)
-        return {"rssm": params["params"], **head_params}, model_state
+        inputs = [jnp.zeros((1, width), dtype) for width in widths]
+        return {"rssm": net.init(key, *inputs)["params"]}
 
     def observe(
         params: PyTree,
-        model_state: PyTree,
         key: Key,
-        carry: Latent,
-        obs: PyTree,
+        latent: Latent,
+        tokens: Array,
         prev_action: Array,
         is_first: Array,
     ) -> Inference:
-        """Infers `[B, T, ...]` after the latent `carry`; `prev_action[:, t]` is a_{t-1}."""
         key_post, key_prior = jax.random.split(key)
-        batch, length = is_first.shape
-        obs, prev_action, is_first = swap_time((obs, prev_action, is_first))
         keep = 1.0 - is_first.astype(dtype)[..., None]
         drive = apply(params, lambda m, a: m.gru.drive(a), prev_action.astype(dtype) * keep)
-        tokens, _ = heads.encode(params, model_state, obs)
         tokens = apply(params, nets.RSSM.read_tokens, tokens)
-        uniform = jax.random.uniform(key_post, (length, batch, config.stoch))
+        uniform = jax.random.uniform(key_post, (*is_first.shape, config.stoch))
 
         def step(latent: Latent, inputs):
             keep, drive, tokens, uniform = inputs
@@ -136,78 +103,19 @@ def rssm(
             return latent, (latent, logits)
 
         inputs = keep, drive, tokens, uniform
-        _, (latent, post_logits) = jax.lax.scan(step, carry, inputs)
+        _, (latent, post_logits) = jax.lax.scan(step, latent, inputs)
         prior_logits = apply(params, nets.RSSM.prior, latent.deter)
         if noise == "independent":
             uniform = jax.random.uniform(key_prior, uniform.shape)
         prior_latent = Latent(latent.deter, sample(prior_logits, uniform))
-        return swap_time(Inference(latent, prior_latent, post_logits, prior_logits))
+        return Inference(latent, prior_latent, post_logits, prior_logits)
 
-    def observe_batch(params: PyTree, model_state: PyTree, key: Key, batch: Batch) -> Inference:
-        steps = batch.trajectory
-        obs, is_first = jax.tree.map(lambda x: x[:, 1:], (steps.obs, steps.is_first))
-        prev_action = steps.action[:, :-1]
-        context = recall(batch.context)
-        return observe(params, model_state, key, context, obs, prev_action, is_first)
-
-    def filter_step(
-        params: PyTree,
-        model_state: PyTree,
-        key: Key,
-        carry: Latent,
-        obs: PyTree,
-        prev_action: Array,
-        is_first: Array,
-    ) -> tuple[Latent, Latent]:
-        one_step = jax.tree.map(lambda x: x[:, None], (obs, prev_action, is_first))
-        inference = observe(params, model_state, key, carry, *one_step)
-        latent = jax.tree.map(lambda x: x[:, 0], inference.latent)
-        return latent, latent
-
-    def explain(
-        params: PyTree, model_state: PyTree, key: Key, batch: Batch
-    ) -> tuple[Explanation, PyTree]:
-        """All at steps 1..T."""
-        inference = observe_batch(params, model_state, key, batch)
-        steps = jax.tree.map(lambda x: x[:, 1:], batch.trajectory)
-        shown = inference.latent
-        if not config.reconstruction_gradient:
-            shown = jax.lax.stop_gradient(shown)
-        obs, _ = heads.decode(params, model_state, features(shown))
-        outcome = heads.outcome(params, features(inference.latent))
-        targets = Targets(steps.obs, steps.reward, steps.is_terminal)
-        return Explanation(inference, Predictions(obs, *outcome), targets), model_state
-
-    def begin(params: PyTree, latent: Latent) -> Imagination:
-        latent = jax.lax.stop_gradient(latent)
-        blocks = apply(params, lambda m, h: m.gru.to_blocks(h), latent.deter)
-        return (blocks, latent), latent
-
-    def starts(params: PyTree, model_state: PyTree, inference: Inference) -> Imagination:
-        """From every inferred state of the batch, terminal ones included."""
-        del model_state
-        flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), inference.latent)
-        return begin(params, flat)
-
-    def follow(
-        params: PyTree, model_state: PyTree, key: Key, batch: Batch, *, horizon: int
-    ) -> tuple[Latent, Imagination]:
-        del horizon
-        key_observe, key_imagine = jax.random.split(key)
-        latent = observe_batch(params, model_state, key_observe, batch).latent
-        carry, _ = begin(params, jax.tree.map(lambda x: x[:, -1], latent))
-        return latent, imagine(
-            params, model_state, key_imagine, carry, batch.trajectory.action[:, -1]
-        )
+    def begin(params: PyTree, latent: Latent) -> tuple[Array, Latent]:
+        return apply(params, lambda m, h: m.gru.to_blocks(h), latent.deter), latent
 
     def imagine(
-        params: PyTree,
-        model_state: PyTree,
-        key: Key,
-        carry: tuple[Array, Latent],
-        action: Array,
+        params: PyTree, key: Key, carry: tuple[Array, Latent], action: Array
     ) -> Imagination:
-        del model_state
         blocks, latent = carry
         drive = apply(params, lambda m, a: m.gru.drive(a), action.astype(dtype))
         blocks, deter, logits = apply(
@@ -217,19 +125,11 @@ def rssm(
         latent = Latent(deter, sample(logits, uniform))
         return (blocks, latent), latent
 
-    def predict(params: PyTree, model_state: PyTree, latent: Latent) -> Predictions:
-        feature = features(latent)
-        obs, _ = heads.decode(params, model_state, feature)
-        return Predictions(obs, *heads.outcome(params, feature))
-
-    return WorldModel(
-        init=init,
-        initial=functools.partial(blank, config, dtype=dtype),
-        memory=remember,
-        filter=filter_step,
-        explain=explain,
-        starts=starts,
-        follow=follow,
-        imagine=imagine,
-        predict=predict,
+    return recurrent(
+        Cell(init, observe, begin, imagine),
+        heads,
+        config,
+        dtype=dtype,
+        one_hot=not deterministic,
+        reconstruction_gradient=config.reconstruction_gradient,
     )
