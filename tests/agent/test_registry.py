@@ -15,6 +15,7 @@ import tiny
 
 import vawm
 from vawm.agent import kinds, make_agent, plugins, registry
+from vawm.cli import flags
 from vawm.config import CUSTOM, Config, HeadsConfig, RSSMConfig, WorldModelConfig
 from vawm.errors import NOT_NEGATIVE, InvalidInput
 from vawm.learning import train
@@ -118,6 +119,7 @@ def test_a_cell_that_runs_again_replaces_its_row_and_no_other(register):
     with pytest.raises(InvalidInput) as error:
         register("storm", MineConfig, rssm)
     assert (error.value.field, error.value.value) == ("agent", "storm")
+    assert "StormConfig of " in error.value.remedy
 
 
 @dataclass(frozen=True)
@@ -239,6 +241,31 @@ def test_programs_offer_what_a_plugin_registers(plugin):
     done = python("-c", PARSE, "--plugin", plugin, "--agent", "own", "--help")
     assert "vagram,own}" in done.stdout
     assert "--world-model.own" in done.stdout
+
+
+@pytest.mark.parametrize("words", [["--plugin"], ["--plugin", "--seed", "1"], ["--plugin="]])
+def test_a_plugin_without_a_name_is_refused(words):
+    with pytest.raises(InvalidInput) as error:
+        flags.load_plugins(words)
+    assert (error.value.field, error.value.value) == ("--plugin", None)
+
+
+def test_words_that_are_not_plugins_stay_in_order(plugin, monkeypatch):
+    monkeypatch.setenv(plugins.VARIABLE, "")
+    monkeypatch.setattr(plugins, "load_named", lambda: None)
+    words = [
+        "--seeds",
+        "0",
+        "1",
+        f"--plugin={plugin}",
+        "--tasks",
+        "a",
+        "--plugin",
+        "m",
+        "--x=-1",
+    ]
+    assert flags.load_plugins(words) == ["--seeds", "0", "1", "--tasks", "a", "--x=-1"]
+    assert os.environ[plugins.VARIABLE].split(os.pathsep) == [str(plugin), "m"]
 
 
 @pytest.mark.parametrize(

@@ -99,7 +99,21 @@ def test_an_update_follows_a_further_loss():
 def test_the_name_of_one_of_our_losses_is_refused(name):
     with pytest.raises(InvalidInput) as error:
         of(adding(**{name: lambda w: w}))
-    assert (error.value.field, error.value.value) == ("Explanation.losses", name)
+    assert (error.value.field, error.value.value) == ("loss", name)
+
+
+def test_losses_on_latents_are_added_by_name_and_none_replaces_another():
+    def losses(critic, slow_critic, inference):
+        return {"mine": 3.0 + 0.0 * inference.latent.deter.sum()}
+
+    value, metrics, _ = of(AGENT._replace(latent_losses=losses))
+    usual, plain, _ = of(AGENT)
+    np.testing.assert_allclose(value - usual, 3.0, rtol=1e-4)
+    assert metrics.keys() - plain.keys() == {"loss/mine"}
+    for taken in (adding(mine=lambda w: w)._replace(latent_losses=losses),):
+        with pytest.raises(InvalidInput) as error:
+            of(taken)
+        assert (error.value.field, error.value.value) == ("loss", "mine")
 
 
 @pytest.mark.parametrize("targets", [True, False])

@@ -22,8 +22,8 @@ class PolicyCarry(NamedTuple):
     action: Array  # [N, A], the raw action that left from the previous observation
 
 
-LatentLoss = Callable[[PyTree, PyTree, Inference], Array]
-"""`(critic_params, slow_critic_params, inference) -> [B, T]`, one more loss of its model."""
+LatentLosses = Callable[[PyTree, PyTree, Inference], dict[str, Array]]
+"""`(critic_params, slow_critic_params, inference) -> {name: [B, T]}`, of the world model."""
 
 
 class Agent(NamedTuple):
@@ -33,7 +33,7 @@ class Agent(NamedTuple):
     world_model: WorldModel
     actor: Actor
     critic: Critic
-    latent_loss: LatentLoss | None = None
+    latent_losses: LatentLosses | None = None
 
     def init(self, key: Key) -> tuple[Params, PyTree]:
         """Fresh parameters, and the `model_state` that the world model carries beside them."""
@@ -117,15 +117,15 @@ def make_agent(config: Config, spec: EnvSpec) -> Agent:
     row, model = registry.kind(config.agent), config.world_model
     feature_size = model.deter + model.stoch * model.classes
     critic = make_critic(config.critic, feature_size, dtype)
-    latent_loss = None
-    if row.make_latent_loss is not None:
-        latent_loss = row.make_latent_loss(critic, model)
+    latent_losses = None
+    if row.make_latent_losses is not None:
+        latent_losses = row.make_latent_losses(critic, model)
     return Agent(
         spec=spec,
         world_model=row.make(model, spec, dtype=dtype, noise=config.value_alignment.noise),
         actor=make_actor(config.actor, spec, feature_size, dtype),
         critic=critic,
-        latent_loss=latent_loss,
+        latent_losses=latent_losses,
     )
 
 

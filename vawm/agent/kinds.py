@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from typing import cast
 
 from vawm import config, nets, presets
+from vawm.agent.actor_critic import Critic
+from vawm.agent.agent import LatentLosses
 from vawm.agent.registry import Activations, register
 from vawm.agent.value_gradient import make_value_gradient_loss
 from vawm.config import (
@@ -114,6 +116,12 @@ def maps(widths: Sequence[int], depth: int, size: int | None, halved: int) -> in
     )
 
 
+def vagram_losses(critic: Critic, model: VagramConfig) -> LatentLosses:
+    """VaGraM's loss by its name."""
+    loss = make_value_gradient_loss(critic, model)
+    return lambda *arguments: {"value_gradient": loss(*arguments)}
+
+
 def register_all() -> None:
     """Adds the rows of the package."""
     rssm_sizes = {size: widths._asdict() for size, widths in config.RSSM_SIZES.items()}
@@ -149,5 +157,5 @@ def register_all() -> None:
         samples_latents=False,
         check=check_rssm,
         activations=rssm_activations,
-        make_latent_loss=make_value_gradient_loss,
+        make_latent_losses=vagram_losses,
     )

@@ -22,17 +22,19 @@ import typing
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-from vawm import config as choices
 from vawm import presets
 from vawm.agent import plugins
-from vawm.config import CUSTOM, Config, LaPropConfig, OptimizerConfig, WorldModelConfig
+from vawm.config import (
+    CUSTOM,
+    Config,
+    LaPropConfig,
+    OptimizerConfig,
+    WorldModelConfig,
+    kinds,
+    with_widths,
+)
 from vawm.errors import InvalidInput, Rule
 from vawm.world_model.protocol import WorldModel
-
-Sizes = Mapping[str, Mapping[str, int]]
-"""Name of a size -> field of the world model's config -> width."""
-Presets = Mapping[str, Mapping[str, Config]]
-"""Suite -> name of a preset -> config."""
 
 
 class Activations(NamedTuple):
@@ -43,6 +45,20 @@ class Activations(NamedTuple):
     maps: int = 0  # in the encoder's and decoder's maps, for the images of one step
 
 
+def default_activations(config: Config, image_size: int | None) -> Activations:
+    """A rough upper bound for an encoder, a recurrence and heads of `units` width."""
+    model, critic = config.world_model, config.critic
+    feature = model.deter + model.stoch * model.classes
+    layers = 12 * model.units + config.actor.layers * config.actor.units
+    observed = 8 * feature + 4 * (layers + critic.layers * critic.units + 4 * critic.bins)
+    size = image_size or 0
+    return Activations(observed, maps=2 * size * size * (3 + 4 * model.depth))
+
+
+def accept(config: Config) -> None:
+    """Refuses nothing."""
+
+
 class AgentKind(NamedTuple):
     """One row.
 
@@ -51,29 +67,32 @@ class AgentKind(NamedTuple):
       make: `(config.world_model, spec, *, dtype, noise) -> WorldModel`.
       optimizer: `LaPropConfig` for one gradient of one summed loss, `AdamConfig` for the world
         model first and then actor and critic.
-      sizes: what `--size` offers.
-      presets: what `--preset` offers.
+      sizes: name -> field of the world model's config -> width; what `--size` offers. If there
+        are none, the only size is custom.
+      presets: suite -> name -> config; what `--preset` offers. If there are none, the presets
+        of dreamerv3 with the defaults of this world model.
       rules: field of the world model's config -> what its number must be; positive if not here.
       check: `(config) -> None`; raises `InvalidInput` for what cannot run.
       activations: `(config, image_size) -> Activations`; `image_size` is None without images.
       context_limited: whether the world model knows only as many positions as a training
         sequence has, so that nothing longer can be imagined.
       samples_latents: whether z and z~ are sampled, so that their noise is a choice.
-      make_latent_loss: `(critic, config.world_model) -> loss(critic_params, slow_critic_params,
-        inference) -> [B, T]`, a further loss of the world model; None for none.
+      make_latent_losses: `(critic, config.world_model) -> losses(critic_params,
+        slow_critic_params, inference) -> {name: [B, T]}`, further losses of the world model;
+        None for none.
     """
 
     world_model: type[WorldModelConfig]
     make: Callable[..., WorldModel]
-    optimizer: type[OptimizerConfig]
-    sizes: Sizes
-    presets: Presets
-    rules: Mapping[str, Rule]
-    check: Callable[[Config], None]
-    activations: Callable[[Config, int | None], Activations]
-    context_limited: bool
-    samples_latents: bool
-    make_latent_loss: Callable[..., Callable[..., Any]] | None
+    optimizer: type[OptimizerConfig] = LaPropConfig
+    sizes: Mapping[str, Mapping[str, int]] = {}
+    presets: Mapping[str, Mapping[str, Config]] = {}
+    rules: Mapping[str, Rule] = {}
+    check: Callable[[Config], None] = accept
+    activations: Callable[[Config, int | None], Activations] = default_activations
+    context_limited: bool = False
+    samples_latents: bool = True
+    make_latent_losses: Callable[..., Callable[..., Any]] | None = None
 
 
 class UnknownAgent(InvalidInput):
@@ -94,22 +113,12 @@ def register(
     name: str,
     world_model: type[WorldModelConfig],
     make: Callable[..., WorldModel],
-    *,
-    optimizer: type[OptimizerConfig] = LaPropConfig,
-    sizes: Sizes | None = None,
-    presets: Presets | None = None,
-    rules: Mapping[str, Rule] | None = None,
-    check: Callable[[Config], None] | None = None,
-    activations: Callable[[Config, int | None], Activations] | None = None,
-    context_limited: bool = False,
-    samples_latents: bool = True,
-    make_latent_loss: Callable[..., Callable[..., Any]] | None = None,
+    **choices: Any,
 ) -> None:
-    """Adds a kind of agent; the arguments are the attributes of `AgentKind`.
+    """Adds a kind of agent; all arguments but the name are attributes of `AgentKind`.
 
-    Without `presets` it gets those of dreamerv3 with this world model's defaults. Without
-    `sizes` the only size is custom. Running a module or a cell of a notebook again replaces the
-    row of the same class; a name that another module has taken is refused.
+    Running a module or a cell of a notebook again replaces the row of the same class. A name
+    that another module has taken is refused.
 
     Raises:
       InvalidInput: a name that is taken or cannot be a name, or a config class that cannot be
@@ -121,24 +130,12 @@ def register(
         raise InvalidInput("agent", name, remedy)
     _check_class(world_model)
     if name in _ROWS and _origin(_ROWS[name].world_model) != _origin(world_model):
-        remedy = (
-            f"is registered by {'.'.join(_origin(_ROWS[name].world_model))}; use another name"
-        )
-        raise InvalidInput("agent", name, remedy)
-    sizes = sizes or {}
-    _ROWS[name] = AgentKind(
-        world_model=world_model,
-        make=make,
-        optimizer=optimizer,
-        sizes=sizes,
-        presets=presets or _presets_like_dreamerv3(name, world_model, sizes),
-        rules=rules or {},
-        check=check or (lambda config: None),
-        activations=activations or default_activations,
-        context_limited=context_limited,
-        samples_latents=samples_latents,
-        make_latent_loss=make_latent_loss,
-    )
+        where, other = _origin(_ROWS[name].world_model)
+        raise InvalidInput("agent", name, f"{other} of {where} has this name; use another one")
+    row = AgentKind(world_model, make, **choices)
+    if not row.presets:
+        row = row._replace(presets=_presets_like_dreamerv3(name, row))
+    _ROWS[name] = row
 
 
 def _origin(cls: type) -> tuple[str, str]:
@@ -153,11 +150,11 @@ def _check_class(cls: type[WorldModelConfig]) -> None:
     name = cls.__name__
     if "__dataclass_params__" not in vars(cls) or not vars(cls)["__dataclass_params__"].frozen:
         raise InvalidInput("world_model", name, "decorate it with @dataclass(frozen=True)")
-    kinds = choices.kinds(cls)  # type: ignore[arg-type]
+    types = kinds(cls)  # type: ignore[arg-type]
     for field in dataclasses.fields(cls):
         if field.default is dataclasses.MISSING:
             raise InvalidInput(f"{name}.{field.name}", None, "has no default; give it one")
-        kind = kinds[field.name]
+        kind = types[field.name]
         if (
             kind not in (int, float, bool, str)
             and typing.get_origin(kind) is not typing.Literal
@@ -166,29 +163,21 @@ def _check_class(cls: type[WorldModelConfig]) -> None:
             raise InvalidInput(f"{name}.{field.name}", kind, remedy)
 
 
-def _presets_like_dreamerv3(name: str, cls: type[WorldModelConfig], sizes: Sizes) -> Presets:
-    """The runs of dreamerv3's presets, with another world model in them."""
+def _presets_like_dreamerv3(name: str, row: AgentKind) -> Mapping[str, Mapping[str, Config]]:
+    """The runs of dreamerv3's presets, with another world model, of its first size."""
+    model = row.world_model()  # type: ignore[call-arg]
 
     def like(config: Config) -> Config:
-        config = dataclasses.replace(config, agent=name, size=CUSTOM, world_model=cls())  # type: ignore[call-arg]
-        for size, widths in sizes.items():  # the first
-            return choices.with_widths(config, size, widths)
-        return config
+        config = dataclasses.replace(config, agent=name, size=CUSTOM, world_model=model)
+        if not row.sizes:
+            return config
+        size = next(iter(row.sizes))
+        return with_widths(config, size, row.sizes[size])
 
     return {
         suite: {preset: like(config) for preset, config in named.items()}
         for suite, named in presets.DREAMERV3.items()
     }
-
-
-def default_activations(config: Config, image_size: int | None) -> Activations:
-    """A rough upper bound for an encoder, a recurrence and heads of `units` width."""
-    model, critic = config.world_model, config.critic
-    feature = model.deter + model.stoch * model.classes
-    layers = 12 * model.units + config.actor.layers * config.actor.units
-    observed = 8 * feature + 4 * (layers + critic.layers * critic.units + 4 * critic.bins)
-    size = image_size or 0
-    return Activations(observed, maps=2 * size * size * (3 + 4 * model.depth))
 
 
 def names() -> tuple[str, ...]:
@@ -216,12 +205,8 @@ def plugin_of(name: str) -> str | None:
     cls = kind(name).world_model
     if cls.__module__.split(".")[0] == "vawm":
         return None
-    path = pathlib.Path(_origin(cls)[0])
-    return str(
-        path.relative_to(pathlib.Path.cwd())
-        if path.is_relative_to(pathlib.Path.cwd())
-        else path
-    )
+    path, here = pathlib.Path(_origin(cls)[0]), pathlib.Path.cwd()
+    return str(path.relative_to(here) if path.is_relative_to(here) else path)
 
 
 def presets_of(config: Config) -> Mapping[str, Config]:
@@ -231,4 +216,4 @@ def presets_of(config: Config) -> Mapping[str, Config]:
 
 def with_size(config: Config, size: str) -> Config:
     """`config` with the widths that its agent has at this size."""
-    return choices.with_widths(config, size, kind(config.agent).sizes[size])
+    return with_widths(config, size, kind(config.agent).sizes[size])

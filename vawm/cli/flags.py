@@ -6,6 +6,7 @@ Every program also takes `--plugin FILE_OR_MODULE ...`, which registers further 
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import dataclasses
 import io
@@ -63,24 +64,17 @@ def load_plugins(argv: list[str]) -> list[str]:
     Raises:
       InvalidInput: no word follows, or one cannot be imported.
     """
-    left: list[str] = []
-    named: list[str] | None = None
-    for word in argv:
-        flag, has_value, value = word.partition("=")
-        if flag == "--plugin":
-            named = (named or []) + ([value] if has_value else [])
-            taking = not has_value
-        elif named is not None and taking and not word.startswith("--"):
-            named.append(word)
-        else:
-            taking = False
-            left.append(word)
-    if named == []:
-        raise InvalidInput(
-            "--plugin", None, "has no value; name a module, or a file like own.py"
-        )
-    if named:
-        plugins.add(named)
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    parser.add_argument("--plugin", nargs="+", action="extend", default=[])
+    try:
+        known, left = parser.parse_known_args(argv)
+    except argparse.ArgumentError:
+        known, left = argparse.Namespace(plugin=[""]), argv
+    if "" in known.plugin:
+        remedy = "has no value; name a module, or a file like own.py"
+        raise InvalidInput("--plugin", None, remedy)
+    if known.plugin:
+        plugins.add(known.plugin)
     return left
 
 

@@ -34,7 +34,6 @@ from vawm.losses import returns
 from vawm.types import (
     Array,
     Batch,
-    Explanation,
     Inference,
     Key,
     Latent,
@@ -64,7 +63,6 @@ NAMES = {
     "reward",
     "continue",
     "dynamics",
-    "value_gradient",
     "value_alignment",
     "actor",
     "critic",
@@ -109,10 +107,12 @@ def make_world_model_loss(agent: Agent, config: Config) -> WorldModelLoss:
         step = warmup_step(config, learner, env_steps)
         aligned = value_alignment(critic, inference, likely.kl, step)
 
-        parts = likely.losses | further_losses(explanation)
-        if agent.latent_loss is not None:
-            value_gradient = agent.latent_loss(params.critic, learner.slow_critic, inference)
-            parts = parts | {"value_gradient": value_gradient}
+        # And what this world model or this agent has besides.
+        further = explanation.losses
+        if agent.latent_losses is not None:
+            of_latents = agent.latent_losses(params.critic, learner.slow_critic, inference)
+            further = joined(further, of_latents)
+        parts = joined(likely.losses, further)
         parts = mean_of_each(parts | {"value_alignment": aligned.weight * aligned.loss})
         metrics = alignment_metrics(aligned) | latent_metrics(
             config.world_model, inference, likely.kl
@@ -123,12 +123,12 @@ def make_world_model_loss(agent: Agent, config: Config) -> WorldModelLoss:
     return world_model_loss
 
 
-def further_losses(explanation: Explanation) -> dict[str, Array]:
-    """The losses that a world model has besides Eq. 2; refuses names that are taken."""
-    for name in explanation.losses:
-        if name in NAMES:
-            raise InvalidInput("Explanation.losses", name, "is taken; use another name")
-    return explanation.losses
+def joined(parts: dict[str, Array], further: dict[str, Array]) -> dict[str, Array]:
+    """`parts` and further losses; refuses a name that is taken."""
+    for name in further:
+        if name in NAMES or name in parts:
+            raise InvalidInput("loss", name, "is taken; use another name")
+    return parts | further
 
 
 def make_behaviour_loss(agent: Agent, config: Config) -> BehaviourLoss:
