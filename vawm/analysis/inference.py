@@ -113,6 +113,17 @@ def make_prior(agent: Agent) -> Callable[..., Array] | None:
     return prior
 
 
+def reconstruction(obs: PyTree) -> PyTree:
+    """`obs` as the decoder predicts it.
+
+    Raises:
+      InvalidInput: the world model has no decoder.
+    """
+    if not jax.tree.leaves(obs):
+        raise InvalidInput("world_model", None, "has no decoder; this analysis needs one")
+    return obs
+
+
 def check(config: Config, *, context: int, depth: int) -> None:
     """Refuses a context and a depth that the world model cannot imagine with.
 

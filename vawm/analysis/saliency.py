@@ -140,7 +140,8 @@ def around(
 
     def decode(stoch: Array) -> PyTree:
         on_it = Latent(deter, on_simplex(stoch))
-        return agent.world_model.predict(params.world_model, model_state, on_it).obs
+        predictions = agent.world_model.predict(params.world_model, model_state, on_it)
+        return inference.reconstruction(predictions.obs)
 
     # No network mixes rows, so the gradient of the sum contains that of each row.
     slope = jax.grad(lambda z: value(params, Latent(deter, on_simplex(z))).sum())(stoch)

@@ -18,7 +18,7 @@ from vawm.analysis.episodes import Episodes, windows
 from vawm.losses.transforms import symlog
 from vawm.policy import Policy
 from vawm.runs.reports import video
-from vawm.types import Batch, PyTree, is_image
+from vawm.types import Batch, Key, Params, PyTree, is_image
 
 
 class Trajectories(NamedTuple):
@@ -61,10 +61,13 @@ def imagine(
     agent = make_agent(policy.config, policy.spec)
     start, batch = draw(episodes, length=context + depth + 1, seed=seed, at_most=at_most)
     length = np.asarray(episodes.length)[:at_most]
-    open_loop = jax.jit(make_open_loop(agent, context=context))
-    predicted = open_loop(
-        policy.params, policy.model_state, jax.random.key(seed), batch
-    ).predicted
+    open_loop = make_open_loop(agent, context=context)
+
+    @jax.jit
+    def predict(params: Params, model_state: PyTree, key: Key, batch: Batch) -> PyTree:
+        return inference.reconstruction(open_loop(params, model_state, key, batch).predicted)
+
+    predicted = predict(policy.params, policy.model_state, jax.random.key(seed), batch)
     time = start[:, None] + np.arange(1, context + depth + 1)
     return Trajectories(
         start=start + 1,

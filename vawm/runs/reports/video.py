@@ -78,7 +78,8 @@ def make(trainer: Trainer, config: Config) -> Callable[[TrainState], list[Video]
                 predict(learner.params, learner.model_state, key, batch)
             )
             truth = jax.device_get(jax.tree.map(lambda x: x[:, 1:], batch.trajectory.obs))
-            videos.append(open_loop_video(truth, predicted, same, context=choices.context))
+            if jax.tree.leaves(predicted):  # there is a decoder
+                videos.append(open_loop_video(truth, predicted, same, context=choices.context))
         times = last_episode(
             *jax.device_get((buffer.trajectory.is_first[0], buffer.trajectory.is_last[0])),
             head=head,
