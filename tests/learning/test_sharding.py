@@ -26,7 +26,11 @@ QUICKLY = {"xla_backend_optimization_level": 0}  # each is compiled twice and ru
 
 
 def test_two_devices_give_what_one_gives():
-    two = {"JAX_PLATFORMS": "cpu", "XLA_FLAGS": "--xla_force_host_platform_device_count=2"}
+    two = {
+        "JAX_PLATFORMS": "cpu",
+        "XLA_FLAGS": "--xla_force_host_platform_device_count=2",
+        "PYTHONPATH": os.pathsep.join(sys.path),  # with tests/support, which pytest adds
+    }
     subprocess.run([sys.executable, __file__], env=os.environ | two, check=True)
 
 
