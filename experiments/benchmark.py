@@ -267,10 +267,10 @@ def run(options: Benchmark) -> dict:
     shapes = from_replay.shapes(config)
     remembered = agent.world_model.initial(options.batch_size)
     context = agent.world_model.memory(remembered)
-    batch = Draw(
-        synthetic_batch(options, shapes.batch, context, seed=0),
-        shapes.contexts and synthetic_batch(options, shapes.contexts, (), seed=1),
-    )
+    batch = Draw(synthetic_batch(options, shapes.batch, context, seed=0), ())
+    if from_replay.has_contexts(config):
+        contexts = synthetic_batch(options, shapes.contexts, (), seed=1)
+        batch = batch._replace(contexts=contexts)
     plain = dataclasses.replace(
         config, value_alignment=dataclasses.replace(config.value_alignment, weight="off")
     )

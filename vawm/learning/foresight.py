@@ -1,4 +1,4 @@
-"""Imagination, and what it promises: steps 4 and 5 of an update."""
+"""Imagination and its returns: steps 4 and 5 of an update."""
 
 from __future__ import annotations
 

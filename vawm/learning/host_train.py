@@ -133,7 +133,8 @@ def make_step(env: HostEnvironment, config: Config, programs: Compiled) -> HostS
     on_host = config.replay.images == "host"
 
     def step(state: TrainState) -> tuple[TrainState, dict[str, Any]]:
-        learner, collector, buffer, credit, key, images = state
+        learner, collector, buffer = state.learner, state.collector, state.replay
+        credit, key, images = state.credit, state.key, state.images
         restarts, arrived = env.restarts, []
         for number in range(config.collect_steps):
             if on_host:
@@ -155,7 +156,15 @@ def make_step(env: HostEnvironment, config: Config, programs: Compiled) -> HostS
         metrics = counters | {"chunk/updates": len(learned)}
         metrics |= jax.tree.map(lambda *parts: sum(parts), *arrived)
         metrics |= {"env/restarts": env.restarts - restarts} | _mean(learned, programs.metrics)
-        return TrainState(learner, collector, buffer, credit, key, images), metrics
+        state = TrainState(
+            learner=learner,
+            collector=collector,
+            replay=buffer,
+            credit=credit,
+            key=key,
+            images=images,
+        )
+        return state, metrics
 
     return step
 

@@ -1,4 +1,4 @@
-"""The record that defines a suite: the record that everything else looks up."""
+"""The record that defines a suite."""
 
 from __future__ import annotations
 
