@@ -109,7 +109,7 @@ def cut(batch, start, stop):
 
 @functools.cache
 def jitted(name, function):
-    """A function of the world model, with a seed in the place of its key."""
+    """A function of the world model, with a seed in place of its key."""
     run = getattr(agent_of(name).world_model, function)
     if function == "follow":
         run = functools.partial(run, horizon=LENGTH)

@@ -121,7 +121,7 @@ def make_step(env: HostEnvironment, config: Config, programs: Compiled) -> HostS
     """Build `step(state) -> (state, metrics)`: collect K steps, then learn.
 
     Counts, credit and metrics are those of `vawm.learning.train.make_train_step`, with
-    `env/restarts` in the place of `env/nonfinite`: the number of environments that failed and
+    `env/restarts` in place of `env/nonfinite`: the number of environments that failed and
     were restarted. Updates do not wait for the step that is simulated at the same time, so
     warm-ups that count env steps do not count it yet. The state that is passed cannot be used
     again: `images` is written in place, the rest is donated.

@@ -1,8 +1,8 @@
 """Replayed images in the memory of the host, for devices that have too little of it.
 
 The store is a ring like replay, of bytes. Replay on the device then holds everything except the
-images, with an empty array in the place of each image; the store holds only the images, with an
-empty array in the place of each vector. Both are trees like an observation; `merge` joins them.
+images, with an empty array in place of each image; the store holds only the images, with an
+empty array in place of each vector. Both are trees like an observation; `merge` joins them.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def read(store: PyTree, positions: Positions) -> PyTree:
 
 
 def without_images(obs: PyTree) -> PyTree:
-    """Observations `[N, ...]` with an empty array in the place of each image."""
+    """Observations `[N, ...]` with an empty array in place of each image."""
     return jax.tree.map(
         lambda x: jnp.zeros((x.shape[0], 0), x.dtype) if is_image(x) else x, obs
     )
