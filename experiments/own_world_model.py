@@ -113,10 +113,13 @@ vawm.agent.register("gru", GRUConfig, gru)
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Trains one agent; returns the exit code."""
-    argv = list(sys.argv[1:] if argv is None else argv)
-    if "--resume" not in argv:
-        argv = ["--agent", "gru", "--task", "cartpole_balance", *argv]
-    return command_line.train(argv, suite="dmc_proprio", description=__doc__)
+    return command_line.train(
+        argv,
+        suite="dmc_proprio",
+        description=__doc__,
+        agent="gru",
+        task="cartpole_balance",
+    )
 
 
 if __name__ == "__main__":

@@ -244,10 +244,10 @@ def test_a_command_is_one_that_would_start(command, monkeypatch):
         flags.read(OPTIONS[program], argv + ["--logdir", "LOGDIR"] * needs)
         return
 
-    def check(argv, *, suite, description, aliases=None):
+    def check(argv, **choices):
         if "--resume" in argv:  # of a run that is not here
             argv = [word for word in argv if word != "--resume"]
-        parsed = command_line.parse(argv, suite=suite, description="", aliases=aliases)
+        parsed = command_line.parse(argv, **choices)
         validate.check(parsed.config)
         suites.check_task(parsed.config)
 

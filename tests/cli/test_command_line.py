@@ -65,6 +65,19 @@ def test_the_defaults_are_the_preset():
     assert parse("--size=16m", "--agent=storm").config == with_size(presets.STORM_QUICK, "16m")
 
 
+def test_a_program_may_have_another_agent_and_task():
+    choices = {
+        "suite": "dmc_proprio",
+        "description": "",
+        "agent": "storm",
+        "task": "hopper_hop",
+    }
+    config = command_line.parse([], **choices).config
+    assert config == dataclasses.replace(presets.STORM_QUICK, task="hopper_hop")
+    config = command_line.parse(["--agent", "vagram", "--task", "walker_run"], **choices).config
+    assert (config.agent, config.task) == ("vagram", "walker_run")
+
+
 def test_other_flags_override_preset_and_size_in_any_order():
     config = parse(
         *("--world-model.deter", "256", "--value-alignment.weight", "off"),

@@ -20,7 +20,7 @@ import tyro
 
 from vawm.agent import registry
 from vawm.cli import flags
-from vawm.config import CUSTOM, Config
+from vawm.config import CUSTOM, AgentName, Config
 from vawm.envs.protocol import EnvironmentFailure
 from vawm.errors import InvalidInput
 from vawm.process import cache, streams
@@ -56,10 +56,17 @@ def train(
     *,
     suite: str,
     description: str,
+    agent: AgentName = "dreamerv3",
+    task: str | None = None,
     aliases: Mapping[str, str] | None = None,
 ) -> int:
-    """What an experiment does: reads its command line and trains; returns the exit code."""
-    arguments = parse(argv, suite=suite, description=description, aliases=aliases)
+    """What an experiment does: reads its command line and trains; returns the exit code.
+
+    The arguments are those of `parse`.
+    """
+    arguments = parse(
+        argv, suite=suite, description=description, agent=agent, task=task, aliases=aliases
+    )
     config, logdir = arguments.config, arguments.logdir
     runner.check(config, logdir, resume=arguments.resume, fresh=arguments.fresh)
     cache.enable()
@@ -79,7 +86,9 @@ def parse(
     *,
     suite: str,
     description: str,
+    agent: AgentName = "dreamerv3",
     preset: str = "quick",
+    task: str | None = None,
     aliases: Mapping[str, str] | None = None,
 ) -> Arguments:
     """Reads `argv` (of the process if None).
@@ -88,7 +97,9 @@ def parse(
       argv: the words after the program's name.
       suite: whose presets there are to choose from.
       description: for the help.
+      agent: the default one.
       preset: the default one.
+      task: the default one; that of the preset if None.
       aliases: flag -> the flag that it stands for.
 
     Raises:
@@ -98,7 +109,7 @@ def parse(
     """
     argv = flags.load_plugins(list(sys.argv[1:] if argv is None else argv))
     argv = [_without_alias(word, aliases or {}) for word in argv]
-    default = Flags(_defaults(argv, suite, preset))
+    default = Flags(_defaults(argv, suite, agent, preset, task))
     given = flags.read(Flags, argv, default=default, description=description)
     if given.fresh and given.logdir is None:
         raise InvalidInput("logdir", None, "--fresh needs the --logdir to start over in")
@@ -116,7 +127,9 @@ def _without_alias(word: str, aliases: Mapping[str, str]) -> str:
     return aliases.get(flag, flag) + equals + value
 
 
-def _defaults(argv: list[str], suite: str, preset: str) -> Config:
+def _defaults(
+    argv: list[str], suite: str, agent: AgentName, preset: str, task: str | None
+) -> Config:
     """First phase: the config that the flags of the second override."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     parser.add_argument("--agent", nargs="?")
@@ -131,8 +144,9 @@ def _defaults(argv: list[str], suite: str, preset: str) -> Config:
         raise InvalidInput("--resume", True, "takes no value; write --resume alone") from None
     if not known.resume or {"-h", "--help"} & set(argv):
         size = None if known.size == CUSTOM else known.size
-        agent = known.agent or "dreamerv3"
-        config = validate.preset(agent, suite, known.preset or preset, size)
+        chosen = known.agent or agent
+        config = validate.preset(chosen, suite, known.preset or preset, size)
+        config = dataclasses.replace(config, task=task or config.task)
         return _with_its_warmup(config, known.env_steps)
     if known.logdir is None:
         raise InvalidInput("logdir", None, "--resume needs the --logdir of the run")
