@@ -9,7 +9,13 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from .transforms import categorical_kl, symlog, two_hot_cross_entropy, unimix_logits
+from .transforms import (
+    LOWEST,
+    categorical_kl,
+    symlog,
+    two_hot_cross_entropy,
+    unimix_logits,
+)
 
 Array = jax.Array
 PyTree = Any
@@ -146,10 +152,11 @@ def continue_loss(logit: Array, target: Array) -> Array:
         L = -(c log p + (1 - c) log(1 - p)),  p = sigmoid(logit)
 
     c may be any probability. In the official DreamerV3 it is gamma, and 0 if terminal; in the
-    official STORM it is 1 and 0.
+    official STORM it is 1 and 0. 0 log 0 is 0.
 
     Args:
-      logit: `[...]`.
+      logit: `[...]`; infinite ones, for a p of exactly 0 or 1, count as -1e30 and 1e30: the
+        loss is 0 where that is right, and huge where it is wrong; the gradient is 0.
       target: `[...]` c, in [0, 1].
 
     Returns:
@@ -160,6 +167,7 @@ def continue_loss(logit: Array, target: Array) -> Array:
     """
     chex.assert_equal_shape([logit, target])
     logit = logit.astype(jnp.float32)
+    logit = jnp.where(jnp.isinf(logit), jnp.sign(logit) * -LOWEST, logit)
     return jax.nn.softplus(logit) - target * logit
 
 

@@ -28,7 +28,8 @@ def value_alignment_loss(
     printed.
 
     There are no free nats. The loss is exactly 0 if both logits are equal, as with a
-    zero-initialised critic.
+    zero-initialised critic. Bins with logit -inf on both sides add nothing; it is infinite
+    where only one side has it, see `categorical_kl`.
 
     Args:
       value_logits: `[..., bins]` critic logits at s_t.
