@@ -377,7 +377,7 @@ def _stop(
     raise RunError(
         f"{reason} at env_steps={progress.env_steps}; "
         f"kept: {checkpoint.kept(logdir)}; details in {names.shown(written)}. "
-        f"{diagnosis.advice(state)}"
+        f"{diagnosis.advice(state, config)}"
     )
 
 
