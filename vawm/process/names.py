@@ -30,6 +30,15 @@ def flag(name: str, path: str | os.PathLike[str]) -> str:
     return f"--{name}{between}{quoted(path)}"
 
 
+def is_utf8(path: str | os.PathLike[str]) -> bool:
+    """Whether the bytes of `path` are text in UTF-8, as some libraries need."""
+    try:
+        os.fsencode(path).decode("utf-8")
+    except UnicodeDecodeError:
+        return False
+    return True
+
+
 def _escaped(text: str) -> str:
     return "".join(map(_character, text))
 
