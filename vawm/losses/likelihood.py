@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from .transforms import (
     LOWEST,
     categorical_kl,
+    finite_kl,
     symlog,
     two_hot_cross_entropy,
     unimix_logits,
@@ -257,7 +258,7 @@ def balanced_kl(
     Args:
       post_logits: `[..., S, K]` of q(z|h,o), before unimix.
       prior_logits: `[..., S, K]` of p(z|h), before unimix.
-      unimix: uniform share mixed into both.
+      unimix: uniform share mixed into both; if it is above 0, no class stays excluded.
 
     Returns:
       `[...]` and `[...]`, both in nats: the first moves the prior, the second the posterior.
@@ -268,6 +269,7 @@ def balanced_kl(
     chex.assert_equal_shape([post_logits, prior_logits])
     stop = jax.lax.stop_gradient
     post, prior = unimix_logits(post_logits, unimix), unimix_logits(prior_logits, unimix)
-    dynamics = categorical_kl(stop(post), prior).sum(-1)
-    representation = categorical_kl(post, stop(prior)).sum(-1)
+    kl = finite_kl if unimix else categorical_kl
+    dynamics = kl(stop(post), prior).sum(-1)
+    representation = kl(post, stop(prior)).sum(-1)
     return dynamics, representation

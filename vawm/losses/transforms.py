@@ -191,7 +191,7 @@ def two_hot_cross_entropies(
       AssertionError: the shapes do not fit each other.
     """
     chex.assert_equal(logits.shape[-1:], bins.shape)
-    logits = floored(logits.astype(jnp.float32))
+    logits = floored(logits)
     normalizer = jax.nn.logsumexp(logits, axis=-1)
     chex.assert_equal_shape([normalizer, *targets])
 
@@ -218,8 +218,8 @@ def categorical_kl(p_logits: Array, q_logits: Array) -> Array:
 
         KL = sum_k p_k (log p_k - log q_k)
 
-    0 log 0 is 0: a class that p excludes, by a logit of -inf or one so low that its probability
-    is 0 in float32, adds nothing, whatever q says of it, and p gets no gradient there.
+    0 log 0 is 0: a class that p excludes adds nothing, whatever q says of it, and p gets no
+    gradient there.
 
     Args:
       p_logits: `[..., K]`, normalised or not; -inf excludes a class.
@@ -233,10 +233,15 @@ def categorical_kl(p_logits: Array, q_logits: Array) -> Array:
       AssertionError: the shapes differ.
     """
     chex.assert_equal_shape([p_logits, q_logits])
-    log_p = jax.nn.log_softmax(floored(p_logits.astype(jnp.float32)))
-    prob = jnp.exp(log_p)
-    log_q = jax.nn.log_softmax(floored(q_logits.astype(jnp.float32), where=prob == 0))
-    return (prob * (log_p - log_q)).sum(-1)
+    missed = ((p_logits > -jnp.inf) & (q_logits == -jnp.inf)).any(-1)
+    return finite_kl(floored(p_logits), floored(q_logits)) + jnp.where(missed, jnp.inf, 0.0)
+
+
+def finite_kl(p_logits: Array, q_logits: Array) -> Array:
+    """`categorical_kl` of logits that are all finite, as those of a head or after unimix."""
+    log_p = jax.nn.log_softmax(p_logits.astype(jnp.float32))
+    log_q = jax.nn.log_softmax(q_logits.astype(jnp.float32))
+    return (jnp.exp(log_p) * (log_p - log_q)).sum(-1)
 
 
 def categorical_entropy(logits: Array) -> Array:
@@ -244,15 +249,16 @@ def categorical_entropy(logits: Array) -> Array:
 
     A class with logit -inf adds nothing and gets no gradient.
     """
-    log_prob = jax.nn.log_softmax(floored(logits.astype(jnp.float32)))
+    log_prob = jax.nn.log_softmax(floored(logits))
     return -(jnp.exp(log_prob) * log_prob).sum(-1)
 
 
 def floored(logits: Array, where: Array | bool = True) -> Array:
-    """The logits, with `LOWEST` for -inf `where` this is true.
+    """The logits in float32, with `LOWEST` for -inf `where` this is true.
 
     Replaced before any sum, so that finite logits keep every bit of a loss and of its gradient.
     """
+    logits = logits.astype(jnp.float32)
     return jnp.where((logits == -jnp.inf) & where, LOWEST, logits)
 
 

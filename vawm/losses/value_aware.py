@@ -124,7 +124,7 @@ def categorical_iter_vaml_loss(prediction_logits: Array, target_logits: Array) -
     """
     chex.assert_equal_shape([prediction_logits, target_logits])
     target = jax.nn.softmax(jax.lax.stop_gradient(target_logits).astype(jnp.float32))
-    prediction = floored(prediction_logits.astype(jnp.float32), where=target == 0)
+    prediction = floored(prediction_logits, where=target == 0)
     return -(target * jax.nn.log_softmax(prediction)).sum(-1)
 
 
