@@ -259,6 +259,7 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_checkpoint(
         "nonfinite_metrics": {"loss/critic": str(value)},
         "nonfinite_parameters": [],
         "nonfinite_replay": [],
+        "largest_reward": {"environment": 0, "reward": 0.0},
     }
 
 
