@@ -46,11 +46,13 @@ from vawm.envs.protocol import check_positive
 from vawm.errors import InvalidInput
 from vawm.policy import Policy, load
 from vawm.process import cache, huge_pages
-from vawm.runs import run_folder
+from vawm.process.names import shown
+from vawm.runs import checkpoint, run_folder
 from vawm.types import is_image
 
 FRAMES_PER_SECOND = 5  # slow enough to compare
 FILM_FRAMES_PER_SECOND = 10
+LONGEST_NAME = 50  # characters of a run in the names of files
 
 
 @dataclass(frozen=True)
@@ -105,11 +107,15 @@ class Played(NamedTuple):
         return self.policy.config
 
 
-def names(logdirs: Sequence[pathlib.Path]) -> list[str]:
-    """Names of the runs: the last parts of each path, as few as make them unique."""
-    parts = [path.expanduser().absolute().parts for path in logdirs]
+def run_names(logdirs: Sequence[pathlib.Path]) -> list[str]:
+    """Names of the runs: the last parts of each path, as few as make them unique.
+
+    They are printable, and leave room for the rest of a file's name.
+    """
+    parts = [path.absolute().parts for path in logdirs]
     for count in range(1, max(map(len, parts)) + 1):
-        found = ["-".join(own[-count:]).replace("/", "") for own in parts]
+        joined = ["-".join(own[-count:]).replace("/", "") for own in parts]
+        found = [shown(name)[-LONGEST_NAME:] for name in joined]
         if len(set(found)) == len(found):
             return found
     raise InvalidInput("logdirs", [str(path) for path in logdirs], "give each run once")
@@ -128,7 +134,8 @@ def prepare(options: Options) -> Loaded:
         raise InvalidInput("every", options.every, "use 0 or a number above")
     if not options.logdirs:
         raise InvalidInput("logdirs", (), "give the folder of at least one run")
-    called = dict(zip(names(options.logdirs), options.logdirs, strict=True))
+    folders = [checkpoint.expanded(path, "logdirs") for path in options.logdirs]
+    called = dict(zip(run_names(folders), folders, strict=True))
     run_folder.check_writable(options.output, "output")
     figures.check()
     plays = options.what != "curves"
@@ -323,7 +330,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         }.items():
             if options.wants(what):
                 show(options, played)
-    print(f"results are in {options.output}")
+    print(f"results are in {shown(options.output)}")
     return 0
 
 

@@ -1,6 +1,9 @@
 """Strict settings of JAX and the compilation cache for every test."""
 
+import ctypes
+import gc
 import os
+import sys
 
 import chex
 import hurry
@@ -27,6 +30,19 @@ def pytest_configure(config):
         for backend in rendering.BACKENDS:
             if fault := rendering.fault(backend):
                 raise pytest.UsageError(f"{backend} does not render here: {fault}")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def memory_of_one_file():
+    """Releases what a file has compiled; a worker would keep the programs of all its files.
+
+    What the next file shares with it is read from the compilation cache.
+    """
+    yield
+    jax.clear_caches()
+    gc.collect()
+    if sys.platform.startswith("linux"):  # glibc keeps freed memory otherwise
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 @pytest.fixture(autouse=True)

@@ -30,8 +30,8 @@ from vawm.config import Config
 from vawm.errors import InvalidInput
 from vawm.policy import Policy, load, weights
 from vawm.policy.play import Score
-from vawm.process import cache, huge_pages
-from vawm.runs import suites
+from vawm.process import cache, huge_pages, names
+from vawm.runs import checkpoint, suites
 from vawm.runs.checkpoint import manifest
 from vawm.runs.reports import tracking
 
@@ -80,7 +80,7 @@ def export(
       InvalidInput: no checkpoint, or a folder that is not empty; nothing was written.
       SaveError: writing failed, for example on a full disk; leaves no files behind.
     """
-    logdir, folder = pathlib.Path(logdir).expanduser(), pathlib.Path(folder).expanduser()
+    logdir, folder = checkpoint.expanded(logdir), checkpoint.expanded(folder, "output")
     weights.check_output(folder)
     policy = policy or load(logdir)
     measured = _last_return(logdir, policy.env_steps)
@@ -121,7 +121,7 @@ def card(policy: Policy, measured: str) -> str:
     """The text of `README.md`; `measured` is the sentence about the policy's score."""
     config, spec = policy.config, policy.spec
     plugin = registry.plugin_of(config.agent)
-    file = pathlib.Path(plugin).name if plugin else ""
+    file = names.shown(pathlib.Path(plugin).name) if plugin else ""
     evaluation = "python -m vawm.evaluate --logdir FOLDER"
     if file:
         evaluation += f" --plugin {file}"
@@ -210,15 +210,15 @@ class Arguments:
 def main(argv: Sequence[str] | None = None) -> int:
     """Exports, prints the folder, and returns the exit code."""
     arguments = flags.read(Arguments, argv, description=__doc__)
-    weights.check_output(arguments.output.expanduser())
+    weights.check_output(checkpoint.expanded(arguments.output, "output"))
     evaluate.check(arguments.episodes or 1, arguments.seed)
     policy, scores = load(arguments.logdir), None
     if arguments.episodes:
         cache.enable()
         scores = evaluate.by_protocol(policy, episodes=arguments.episodes, seed=arguments.seed)
     folder = export(arguments.logdir, arguments.output, policy=policy, scores=scores)
-    print(f"exported to {folder}" + (f", return {scores}" if scores else ""))
-    print(f"evaluate with: python -m vawm.evaluate --logdir {folder}")
+    print(f"exported to {names.shown(folder)}" + (f", return {scores}" if scores else ""))
+    print(f"evaluate with: python -m vawm.evaluate {names.flag('logdir', folder)}")
     return 0
 
 

@@ -12,6 +12,7 @@ from typing import Literal
 import jax
 import pytest
 import tiny
+from refusals import refused
 
 import vawm
 from vawm.agent import kinds, make_agent, plugins, registry
@@ -248,6 +249,14 @@ def test_a_plugin_without_a_name_is_refused(words):
     with pytest.raises(InvalidInput) as error:
         flags.load_plugins(words)
     assert (error.value.field, error.value.value) == ("--plugin", None)
+
+
+def test_a_plugin_whose_path_has_the_separator_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setenv(plugins.VARIABLE, "")
+    path = tmp_path / "a:b" / "own.py"
+    with refused("plugin", str(path), naming=[repr(os.pathsep), plugins.VARIABLE]):
+        plugins.add([str(path)])
+    assert os.environ[plugins.VARIABLE] == ""
 
 
 def test_words_that_are_not_plugins_stay_in_order(plugin, monkeypatch):

@@ -214,3 +214,13 @@ def test_heat_is_dark_grey_for_zeros_and_coloured_elsewhere():
     heated = figures.heat(seen, maps)
     np.testing.assert_array_equal(heated[0, 1], np.full((2, 3), 100))
     assert len(set(heated[0, 0, 0].tolist())) > 1
+
+
+def test_any_name_of_a_run_is_drawn_as_it_is(tmp_path):
+    """`$` is not mathematics, and `_` does not leave a run out of the legend."""
+    name = r"_a$x_{$ \frac$"
+    with figures.panels(tmp_path / "[1]*\n.png", 1, 1, size=(3, 3)) as axes:
+        axes[0, 0].plot([0, 1], [0, 1], label=figures.plain(name))
+        shown = axes[0, 0].legend().get_texts()
+    assert [text.get_text().replace(r"\$", "$").strip() for text in shown] == [name]
+    assert list(tmp_path.iterdir())

@@ -3,6 +3,7 @@
 import csv
 import importlib.util
 import json
+import os
 import pathlib
 import re
 import shlex
@@ -345,8 +346,13 @@ def test_the_guide_names_the_folders_of_its_ablations():
 
 def test_runs_are_named_by_unique_parts_of_their_paths():
     paths = [pathlib.Path(path) for path in ("/a/x/run", "/a/y/run", "/a/y/other")]
-    assert analyse.names(paths[1:]) == ["run", "other"]
-    assert analyse.names(paths) == ["x-run", "y-run", "y-other"]
+    assert analyse.run_names(paths[1:]) == ["run", "other"]
+    assert analyse.run_names(paths) == ["x-run", "y-run", "y-other"]
+
+
+def test_names_of_runs_are_printable_and_leave_room_for_endings():
+    paths = [pathlib.Path("/a") / name for name in (os.fsdecode(b"\xff\n[1]"), 250 * "n" + "1")]
+    assert analyse.run_names(paths) == [r"\xff\n[1]", 49 * "n" + "1"]
 
 
 def test_rows_and_objects_are_written_as_they_are(tmp_path):

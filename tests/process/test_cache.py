@@ -1,5 +1,6 @@
 """The folder of the compilation cache."""
 
+import os
 import pathlib
 
 import jax
@@ -41,10 +42,12 @@ def test_it_can_be_switched_off(monkeypatch):
     assert not jax.config.jax_enable_compilation_cache
 
 
-def test_a_folder_that_cannot_be_written_is_a_warning(tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize("name", ["file/below", os.fsdecode(b"\xff")])
+def test_a_folder_that_cannot_be_used_is_a_warning(tmp_path, monkeypatch, capsys, name):
     (tmp_path / "file").touch()
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "file" / "below"))
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / name))
     assert cache.enable() is None
+    assert jax.config.jax_compilation_cache_dir is None
     warning = capsys.readouterr().err
     assert warning.startswith("warning: no compilation cache")
     assert warning.count("\n") == 1

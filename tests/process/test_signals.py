@@ -1,6 +1,7 @@
 """The first signal asks a run to stop, the second kills it, even inside a long call."""
 
 import os
+import pathlib
 import signal
 import subprocess
 import sys
@@ -10,6 +11,18 @@ import time
 import pytest
 
 from vawm.process import signals
+
+
+@pytest.fixture(autouse=True)
+def usual_handlers():
+    """Of a process in a terminal, which children inherit: `nohup` and `&` ignore some."""
+    usual = dict.fromkeys(signals.SIGNALS, signal.SIG_DFL)
+    usual[signal.SIGINT] = signal.default_int_handler
+    before = {number: signal.signal(number, handler) for number, handler in usual.items()}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
 
 SCRIPT = """
 import ctypes, sys
@@ -103,3 +116,17 @@ def test_outside_the_main_thread_nothing_is_caught():
     thread.start()
     thread.join()
     assert codes == [0]
+
+
+def test_these_tests_pass_under_nohup_and_in_the_background():
+    """There, SIGHUP and SIGINT are ignored by inheritance."""
+    tests = ("once", "notice", "earlier", "stays_ignored")
+    words = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-k", " or ".join(tests)]
+    done = subprocess.run(
+        ["sh", "-c", 'trap "" HUP INT; exec "$@"', "sh", *words, __file__],
+        capture_output=True,
+        text=True,
+        cwd=pathlib.Path(__file__).parents[2],
+    )
+    assert done.returncode == 0, done.stdout
+    assert "6 passed" in done.stdout

@@ -173,10 +173,16 @@ def test_a_stream_replaced_inside_the_block_stays_replaced(monkeypatch):
     assert (sys.stdout, sys.stderr) == (other, before)
 
 
-def test_text_that_cannot_be_encoded_is_still_an_error():
-    out = streams.Lasting(io.TextIOWrapper(io.BytesIO(), "ascii"), "standard output")
-    with pytest.raises(UnicodeEncodeError):
-        out.write("\u00fc")
+@pytest.mark.parametrize(
+    ("encoding", "text", "written"),
+    [("ascii", "f\u00fcr", b"f\\xfcr"), ("utf-8", "\udcff f\u00fcr", b"\\udcff f\xc3\xbcr")],
+)
+def test_characters_that_cannot_be_encoded_are_escaped(encoding, text, written):
+    file = io.BytesIO()
+    out = streams.Lasting(io.TextIOWrapper(file, encoding), "standard output")
+    assert out.write(text) == len(text)
+    out.flush()
+    assert file.getvalue() == written
 
 
 def test_the_earlier_streams_are_restored():

@@ -259,6 +259,7 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_checkpoint(
         "nonfinite_metrics": {"loss/critic": str(value)},
         "nonfinite_parameters": [],
         "nonfinite_replay": [],
+        "largest_reward": {"environment": 0, "reward": 0.0},
     }
 
 
@@ -328,13 +329,13 @@ def test_an_environment_is_not_blamed_if_an_earlier_action_was_not_finite():
     nan = math.nan
     replay_of_both = stored([[1.0, 1.0], [1.0, nan]])
     blamed = toy.state()._replace(replay=replay_of_both, collector=arrived())
-    assert blames_environment(diagnosis.advice(blamed))
+    assert blames_environment(diagnosis.advice(blamed, tiny.CONFIG))
     actions = blamed.replay.trajectory.action
     same, before = (actions.at[1, slot].set(nan) for slot in newest(blamed.replay, 0, 1))
     for action, environment in ((same, True), (before, False)):
         trajectory = blamed.replay.trajectory._replace(action=action)
         state = blamed._replace(replay=blamed.replay._replace(trajectory=trajectory))
-        assert blames_environment(diagnosis.advice(state)) == environment
+        assert blames_environment(diagnosis.advice(state, tiny.CONFIG)) == environment
         reason = diagnosis.reason(state, {"chunk/nonfinite": 1}, last=False)
         assert ("an environment" in reason) == environment
         assert ("action" in reason) != environment
@@ -348,6 +349,32 @@ def blames_environment(advice):
     named = "reward" in advice and "environment 1" in advice
     assert named != ("--optimizer.learning-rate" in advice)
     return named
+
+
+@pytest.mark.parametrize("reward", [3e38, -3e38])
+def test_rewards_beyond_the_returns_of_float32_are_named_and_not_the_learning_rate(
+    tmp_path, reward
+):
+    """They are finite, and so is their symlog, but not their sum."""
+    plain = tiny.env()
+
+    def step(state, action):
+        state, timestep = plain.step(state, action)
+        return state, timestep._replace(reward=jnp.full_like(timestep.reward, reward))
+
+    with pytest.raises(RunError, match=r"loss/.* is nan ") as error:
+        run(tiny.CONFIG, tmp_path, env=plain._replace(step=step))
+    for name in ("environment", f"{reward:.3g}", "float32"):
+        assert name in str(error.value)
+    assert "learning-rate" not in str(error.value)
+    diagnosed = json.loads((tmp_path / "diagnosis.json").read_text())
+    assert diagnosed["largest_reward"]["reward"] == pytest.approx(reward)
+
+
+def test_rewards_that_returns_can_hold_are_not_blamed():
+    for reward, blamed in ((1e35, False), (1.1e36, True), (-1.1e36, True)):
+        state = toy.state()._replace(replay=stored([[1.0], [reward]]), collector=arrived())
+        assert blames_environment(diagnosis.advice(state, tiny.CONFIG)) == blamed
 
 
 def newest(buffer, *ago):

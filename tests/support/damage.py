@@ -1,11 +1,16 @@
-"""Damages files of a checkpoint and checks that they are refused."""
+"""Damaged checkpoints and incomplete ones, and the check that damage is refused."""
+
+import contextlib
+import shutil
+from unittest import mock
 
 import pytest
 import toy
-from runs import files_of
+from runs import files_of, save_toy
 
 from vawm.errors import InvalidInput
 from vawm.runs import checkpoint
+from vawm.runs.checkpoint import handle, writing
 
 
 def flip(file):
@@ -86,3 +91,20 @@ def corrupt(logdir, expected, count, rng):
             file.rmdir()
         file.write_bytes(contents[file])
     return refused
+
+
+def save_unmerged(logdir, state, env_steps):
+    """Saves as earlier versions did in a path with brackets: Orbax does not merge its files.
+
+    Returns the checkpoint, which `vawm.runs.checkpoint.store` describes.
+    """
+    with (
+        mock.patch.object(handle, "plain", contextlib.nullcontext),
+        mock.patch.object(writing, "_check"),
+    ):
+        saved = save_toy(logdir / "[1e-4]", state, env_steps)
+    path = checkpoint.root(logdir) / saved.name
+    path.parent.mkdir(exist_ok=True)
+    saved.rename(path)
+    shutil.rmtree(logdir / "[1e-4]")
+    return path

@@ -24,10 +24,14 @@ def add(names: list[str]) -> None:
     Files are found from any working directory afterwards.
 
     Raises:
-      InvalidInput: one cannot be imported.
+      InvalidInput: one cannot be imported, or has the separator in its path.
     """
     known = [name for name in os.environ.get(VARIABLE, "").split(os.pathsep) if name]
     absolute = [str(pathlib.Path(name).resolve()) if _is_file(name) else name for name in names]
+    for name in absolute:
+        if os.pathsep in name:
+            remedy = f"has a {os.pathsep!r}, which separates plugins in {VARIABLE}"
+            raise InvalidInput("plugin", name, f"{remedy}; copy the file to a path without it")
     os.environ[VARIABLE] = os.pathsep.join(dict.fromkeys([*known, *absolute]))
     load_named()
 

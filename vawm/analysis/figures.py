@@ -52,6 +52,15 @@ def check() -> None:
         raise RunError("matplotlib is not installed: pip install 'vawm[analysis]'")
 
 
+def plain(name: str) -> str:
+    r"""The name of a run as text of a figure.
+
+    Matplotlib would typeset what is between two `$`, and leave names that begin with `_` out of
+    legends.
+    """
+    return name.replace("$", r"\$").replace("_", " _", 1 if name.startswith("_") else 0)
+
+
 @contextlib.contextmanager
 def panels(
     path: pathlib.Path, rows: int, columns: int, *, size: tuple[float, float]
@@ -84,7 +93,7 @@ def value_errors(entries: Mapping[str, Report | Group], path: pathlib.Path) -> N
                 mean = run.by_depth.mean(measure)
                 error = np.nan_to_num(run.by_depth.standard_error(measure))
                 depth = np.arange(len(mean))
-                ax.plot(depth, mean, color=f"C{color}", label=name)
+                ax.plot(depth, mean, color=f"C{color}", label=plain(name))
                 ax.fill_between(
                     depth, mean - error, mean + error, color=f"C{color}", alpha=0.2, lw=0
                 )
@@ -122,7 +131,7 @@ def values(name: str, report: Report, path: pathlib.Path, *, rollouts: int = 12)
                 lw=1,
                 label="V of imagined states" if i == 0 else None,
             )
-        over_time.set(title=name, xlabel="step of the first episode")
+        over_time.set(title=plain(name), xlabel="step of the first episode")
         known = np.concatenate([truth.ravel() for truth, _ in truths.values()])
         if np.isfinite(known).any():
             ends = [np.nanmin(known), np.nanmax(known)]
@@ -161,7 +170,7 @@ def strip(name: str, trajectories: Trajectories, path: pathlib.Path, *, every: i
         for row, label in enumerate(("truth", "imagined", "difference")):
             axes[row, 0].set_ylabel(label, fontsize=8)
         axes[0, 0].figure.suptitle(
-            f"{name}, from step {trajectories.start[0]} of an episode", fontsize=9
+            f"{plain(name)}, from step {trajectories.start[0]} of an episode", fontsize=9
         )
 
 
@@ -188,7 +197,9 @@ def coordinates(name: str, trajectories: Trajectories, path: pathlib.Path) -> No
             ax.axvline(time[trajectories.context - 1], color="C2", lw=1, label="last seen")
             ax.set_title(f"symlog of coordinate {i}", fontsize=9)
         axes[0, 0].legend(fontsize=8)
-        axes[0, 0].figure.suptitle(f"{name}, one window by step of its episode", fontsize=9)
+        axes[0, 0].figure.suptitle(
+            f"{plain(name)}, one window by step of its episode", fontsize=9
+        )
 
 
 def saliency_images(name: str, look: Look, path: pathlib.Path) -> None:
@@ -217,7 +228,7 @@ def saliency_images(name: str, look: Look, path: pathlib.Path) -> None:
             zip(look.step, look.saliency.states, strict=True)
         ):
             axes[0, column].set_title(f"step {step}, {name_of_v} {value:.3g}", fontsize=7)
-        axes[0, 0].figure.suptitle(name, fontsize=9)
+        axes[0, 0].figure.suptitle(plain(name), fontsize=9)
 
 
 def heat(seen: np.ndarray, maps: np.ndarray) -> np.ndarray:
@@ -241,7 +252,7 @@ def saliency_vectors(looks: Mapping[str, Look], path: pathlib.Path) -> None:
                 assert found is not None
                 width = 0.8 / len(looks)
                 place = np.arange(found.shape[1]) + (number + 0.5) * width - 0.4
-                ax.bar(place, found.mean(0), width, label=name)
+                ax.bar(place, found.mean(0), width, label=plain(name))
             ax.set_title(label, fontsize=9)
             ax.set_xlabel("coordinate", fontsize=9)
         axes[0, 0].legend(fontsize=8)
@@ -260,7 +271,7 @@ def curves(all_curves: Curves, path: pathlib.Path) -> None:
                     line = own[metric]
                     steps = line.env_steps / 1000
                     seeds = f" ({line.seeds} seeds)" if line.seeds > 1 else ""
-                    ax.plot(steps, line.mean, color=f"C{color}", label=name + seeds)
+                    ax.plot(steps, line.mean, color=f"C{color}", label=plain(name) + seeds)
                     ax.fill_between(
                         steps, line.low, line.high, color=f"C{color}", alpha=0.2, lw=0
                     )

@@ -23,7 +23,7 @@ from vawm.cli import flags
 from vawm.config import CUSTOM, AgentName, Config
 from vawm.envs.protocol import EnvironmentFailure
 from vawm.errors import InvalidInput
-from vawm.process import cache, streams
+from vawm.process import cache, names, streams
 from vawm.runs import resume, runner, validate
 from vawm.runs.checkpoint import SaveError
 from vawm.runs.runner import RunError
@@ -76,7 +76,7 @@ def train(
         resume=arguments.resume,
         fresh=arguments.fresh,
         banner=describe(config),
-        command=f"python {pathlib.Path(sys.argv[0])}",
+        command=f"python {names.quoted(pathlib.Path(sys.argv[0]))}",
     )
     return result.exit_code
 

@@ -64,8 +64,9 @@ def make_value_alignment(
             prior_logits,
             dynamics_scale=alignment.dynamics_scale,
             representation_scale=alignment.representation_scale,
+            finite=True,
         )
-        kl = transforms.categorical_kl(*jax.lax.stop_gradient((logits, prior_logits)))
+        kl = transforms.finite_kl(*jax.lax.stop_gradient((logits, prior_logits)))
         return Alignment(loss, weight_of(latent_kl, step), kl)
 
     return value_alignment

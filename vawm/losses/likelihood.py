@@ -9,7 +9,14 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from .transforms import categorical_kl, symlog, two_hot_cross_entropy, unimix_logits
+from .transforms import (
+    LOWEST,
+    categorical_kl,
+    finite_kl,
+    symlog,
+    two_hot_cross_entropy,
+    unimix_logits,
+)
 
 Array = jax.Array
 PyTree = Any
@@ -146,10 +153,11 @@ def continue_loss(logit: Array, target: Array) -> Array:
         L = -(c log p + (1 - c) log(1 - p)),  p = sigmoid(logit)
 
     c may be any probability. In the official DreamerV3 it is gamma, and 0 if terminal; in the
-    official STORM it is 1 and 0.
+    official STORM it is 1 and 0. 0 log 0 is 0.
 
     Args:
-      logit: `[...]`.
+      logit: `[...]`; infinite ones, for a p of exactly 0 or 1, count as -1e30 and 1e30: the
+        loss is 0 where that is right, and huge where it is wrong; the gradient is 0.
       target: `[...]` c, in [0, 1].
 
     Returns:
@@ -160,6 +168,7 @@ def continue_loss(logit: Array, target: Array) -> Array:
     """
     chex.assert_equal_shape([logit, target])
     logit = logit.astype(jnp.float32)
+    logit = jnp.where(jnp.isinf(logit), jnp.sign(logit) * -LOWEST, logit)
     return jax.nn.softplus(logit) - target * logit
 
 
@@ -249,7 +258,7 @@ def balanced_kl(
     Args:
       post_logits: `[..., S, K]` of q(z|h,o), before unimix.
       prior_logits: `[..., S, K]` of p(z|h), before unimix.
-      unimix: uniform share mixed into both.
+      unimix: uniform share mixed into both; if it is above 0, no class stays excluded.
 
     Returns:
       `[...]` and `[...]`, both in nats: the first moves the prior, the second the posterior.
@@ -260,6 +269,7 @@ def balanced_kl(
     chex.assert_equal_shape([post_logits, prior_logits])
     stop = jax.lax.stop_gradient
     post, prior = unimix_logits(post_logits, unimix), unimix_logits(prior_logits, unimix)
-    dynamics = categorical_kl(stop(post), prior).sum(-1)
-    representation = categorical_kl(post, stop(prior)).sum(-1)
+    kl = finite_kl if unimix else categorical_kl
+    dynamics = kl(stop(post), prior).sum(-1)
+    representation = kl(post, stop(prior)).sum(-1)
     return dynamics, representation

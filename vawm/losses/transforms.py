@@ -16,6 +16,9 @@ import numpy as np
 
 Array = jax.Array
 
+LOWEST = -1e30
+"""Stands for a logit of -inf inside of sums: its probability is 0 too, but 0 * LOWEST is 0."""
+
 
 def symlog(x: Array) -> Array:
     """Compresses magnitude, keeps sign and slope around 0 (DreamerV3; Hafner et al., 2025).
@@ -173,10 +176,11 @@ def two_hot_cross_entropies(
         CE_k = logsumexp(logits) - (1 - w_k) * logits[below_k] - w_k * logits[above_k]
 
     The two logits are read by index and the log-sum-exp is shared, so neither dense targets
-    nor a log-softmax are built.
+    nor a log-softmax are built. 0 log 0 is 0.
 
     Args:
-      logits: `[..., n]`.
+      logits: `[..., n]`; -inf for an impossible bin counts as `LOWEST`, so weight of a target
+        on one costs 1e30 nats.
       targets: each `[...]`, in the units of `bins`; clipped to the end bins.
       bins: `[n]` increasing.
 
@@ -187,7 +191,7 @@ def two_hot_cross_entropies(
       AssertionError: the shapes do not fit each other.
     """
     chex.assert_equal(logits.shape[-1:], bins.shape)
-    logits = logits.astype(jnp.float32)
+    logits = floored(logits)
     normalizer = jax.nn.logsumexp(logits, axis=-1)
     chex.assert_equal_shape([normalizer, *targets])
 
@@ -199,7 +203,10 @@ def two_hot_cross_entropies(
 
 
 def unimix_logits(logits: Array, unimix: float) -> Array:
-    """log((1 - u) * softmax(logits) + u / K): normalised, each class at least u / K."""
+    """log((1 - u) * softmax(logits) + u / K): normalised, each class at least u / K.
+
+    So for u > 0 a class with logit -inf, such as an action that is masked, is possible again.
+    """
     log_prob = jax.nn.log_softmax(logits.astype(jnp.float32))
     if unimix == 0:
         return log_prob
@@ -211,26 +218,48 @@ def categorical_kl(p_logits: Array, q_logits: Array) -> Array:
 
         KL = sum_k p_k (log p_k - log q_k)
 
+    0 log 0 is 0: a class that p excludes adds nothing, whatever q says of it, and p gets no
+    gradient there.
+
     Args:
-      p_logits: `[..., K]`, normalised or not.
-      q_logits: `[..., K]`, normalised or not.
+      p_logits: `[..., K]`, normalised or not; -inf excludes a class.
+      q_logits: `[..., K]`, likewise. At least one class is not excluded.
 
     Returns:
-      `[...]` in nats, in float32; exactly 0 for equal finite logits. Nothing is stopped.
+      `[...]` in nats, in float32; exactly 0 for equal logits. Infinite where q excludes a class
+      that p does not; the gradient has no meaning there. Nothing is stopped.
 
     Raises:
       AssertionError: the shapes differ.
     """
     chex.assert_equal_shape([p_logits, q_logits])
+    missed = ((p_logits > -jnp.inf) & (q_logits == -jnp.inf)).any(-1)
+    return finite_kl(floored(p_logits), floored(q_logits)) + jnp.where(missed, jnp.inf, 0.0)
+
+
+def finite_kl(p_logits: Array, q_logits: Array) -> Array:
+    """`categorical_kl` of logits that are all finite, as those of a head or after unimix."""
     log_p = jax.nn.log_softmax(p_logits.astype(jnp.float32))
     log_q = jax.nn.log_softmax(q_logits.astype(jnp.float32))
     return (jnp.exp(log_p) * (log_p - log_q)).sum(-1)
 
 
 def categorical_entropy(logits: Array) -> Array:
-    """Entropy of softmax(logits) in nats, over the last axis."""
-    log_prob = jax.nn.log_softmax(logits.astype(jnp.float32))
+    """Entropy of softmax(logits) in nats, over the last axis; 0 log 0 is 0.
+
+    A class with logit -inf adds nothing and gets no gradient.
+    """
+    log_prob = jax.nn.log_softmax(floored(logits))
     return -(jnp.exp(log_prob) * log_prob).sum(-1)
+
+
+def floored(logits: Array, where: Array | bool = True) -> Array:
+    """The logits in float32, with `LOWEST` for -inf `where` this is true.
+
+    Replaced before any sum, so that finite logits keep every bit of a loss and of its gradient.
+    """
+    logits = logits.astype(jnp.float32)
+    return jnp.where((logits == -jnp.inf) & where, LOWEST, logits)
 
 
 def _neighbours(y: Array, bins: Array) -> tuple[Array, Array, Array]:

@@ -6,7 +6,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from .transforms import categorical_kl
+from .transforms import categorical_kl, finite_kl
 
 Array = jax.Array
 
@@ -17,6 +17,7 @@ def value_alignment_loss(
     *,
     dynamics_scale: float,
     representation_scale: float,
+    finite: bool = False,
 ) -> Array:
     """KL divergence of the value distributions at s_t and at its prediction s~_t, Eq. 4.
 
@@ -28,13 +29,15 @@ def value_alignment_loss(
     printed.
 
     There are no free nats. The loss is exactly 0 if both logits are equal, as with a
-    zero-initialised critic.
+    zero-initialised critic. Bins with logit -inf on both sides add nothing; it is infinite
+    where only one side has it, see `categorical_kl`.
 
     Args:
       value_logits: `[..., bins]` critic logits at s_t.
       prior_value_logits: `[..., bins]` logits of the same critic at s~_t.
       dynamics_scale: weight of the term that moves the prediction.
       representation_scale: weight of the term that moves the inference.
+      finite: spares the search for -inf, where all logits are finite, as a critic's are.
 
     Returns:
       `[...]` losses in nats. Gradients reach both logits: the caller stops the critic's
@@ -44,8 +47,9 @@ def value_alignment_loss(
       AssertionError: the shapes differ.
     """
     stop = jax.lax.stop_gradient
-    dynamics = categorical_kl(stop(value_logits), prior_value_logits)
-    representation = categorical_kl(value_logits, stop(prior_value_logits))
+    kl = finite_kl if finite else categorical_kl
+    dynamics = kl(stop(value_logits), prior_value_logits)
+    representation = kl(value_logits, stop(prior_value_logits))
     return dynamics_scale * dynamics + representation_scale * representation
 
 

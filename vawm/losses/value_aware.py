@@ -10,6 +10,8 @@ import chex
 import jax
 import jax.numpy as jnp
 
+from .transforms import floored
+
 Array = jax.Array
 
 
@@ -113,14 +115,17 @@ def categorical_iter_vaml_loss(prediction_logits: Array, target_logits: Array) -
       target_logits: `[..., bins]` logits of the same critic at the true next state.
 
     Returns:
-      `[...]` losses in nats. The target is stopped; the caller stops the critic's parameters.
+      `[...]` losses in nats; a bin of target 0 adds nothing, and the loss is infinite if the
+      prediction excludes a bin, by -inf, that the target does not. The target is stopped; the
+      caller stops the critic's parameters.
 
     Raises:
       AssertionError: the shapes differ.
     """
     chex.assert_equal_shape([prediction_logits, target_logits])
     target = jax.nn.softmax(jax.lax.stop_gradient(target_logits).astype(jnp.float32))
-    return -(target * jax.nn.log_softmax(prediction_logits.astype(jnp.float32))).sum(-1)
+    prediction = floored(prediction_logits, where=target == 0)
+    return -(target * jax.nn.log_softmax(prediction)).sum(-1)
 
 
 def _deviations(prediction_values: Array, target_value: Array) -> Array:

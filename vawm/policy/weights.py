@@ -26,6 +26,7 @@ import safetensors.numpy
 
 from vawm.config import Config, as_dict
 from vawm.errors import InvalidInput
+from vawm.process import names
 from vawm.runs import checkpoint, run_folder, validate
 from vawm.runs.checkpoint import manifest
 from vawm.runs.checkpoint.manifest import LeafInfo
@@ -85,7 +86,7 @@ class Description(NamedTuple):
 
 def found(folder: str | os.PathLike[str]) -> bool:
     """Whether `write` wrote `folder`, even if it is damaged now; False for that of a run."""
-    folder = pathlib.Path(folder).expanduser()
+    folder = checkpoint.expanded(folder)
     if os.path.isfile(folder / MODEL):  # False as well without permission to look
         return True
     try:
@@ -98,8 +99,9 @@ def check_output(folder: pathlib.Path) -> None:
     """Refuses a folder that is not writable or not empty; writes nothing.
 
     Raises:
-      InvalidInput: it is not writable or not empty.
+      InvalidInput: it is not writable or not empty, or its path is too long.
     """
+    run_folder.check_length(folder, "output")
     run_folder.check_writable(folder.parent, "output")
     if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
         raise InvalidInput("output", str(folder), "already exists; choose another --output")
@@ -125,7 +127,7 @@ def write(
     validate.check(config)
     validate.check_spec(config, spec)
     leaves = {name: np.asarray(leaf) for name, leaf in _flatten(params, model_state).items()}
-    scratch = folder.absolute().with_name(f".{folder.name}.tmp-{os.getpid()}")
+    scratch = folder.absolute().with_name(f".vawm-export-{os.getpid()}")  # never too long
     content = {
         "format": FORMAT,
         "schema": SCHEMA,
@@ -139,14 +141,15 @@ def write(
         safetensors.numpy.save_file(leaves, scratch / MODEL, metadata={"format": "np"})
         content["sha256"] = manifest.sha256(scratch / MODEL)
         (scratch / CONFIG).write_text(json.dumps(content, indent=2) + "\n")
-        (scratch / CARD).write_text(card)
+        (scratch / CARD).write_text(card, encoding="utf-8")
         (scratch / MODEL).chmod((scratch / CARD).stat().st_mode)  # safetensors sets 0600
         for path in (*scratch.iterdir(), scratch):
             manifest.sync(path)
         scratch.replace(folder.absolute())
     except (OSError, safetensors.SafetensorError) as error:
         shutil.rmtree(scratch, ignore_errors=True)
-        raise checkpoint.SaveError(f"{folder} could not be written: {error}") from error
+        why = f"{names.shown(folder)} could not be written: {error}"
+        raise checkpoint.SaveError(why) from error
 
 
 def describe(folder: str | os.PathLike[str]) -> Description:
@@ -155,7 +158,7 @@ def describe(folder: str | os.PathLike[str]) -> Description:
     Raises:
       InvalidInput: it is damaged, or another version wrote it (`OtherVersion`).
     """
-    path = pathlib.Path(folder).expanduser() / CONFIG
+    path = checkpoint.expanded(folder) / CONFIG
     try:
         content = _content(path)
         written = content["vawm"]
@@ -205,7 +208,7 @@ def read(
     Raises:
       InvalidInput: a name, shape or dtype differs, or the file is damaged.
     """
-    path = pathlib.Path(folder).expanduser() / MODEL
+    path = checkpoint.expanded(folder) / MODEL
     expected = _flatten(params, model_state)
     infos = {name: manifest.leaf_info(leaf) for name, leaf in expected.items()}
     try:

@@ -1,1 +1,2 @@
-"""The process of a program: compilation cache, memory pages, signals, standard output."""
+"""The process of a program: compilation cache, memory pages, signals, standard output,
+names of files as text."""

@@ -12,6 +12,8 @@ import sys
 
 import jax
 
+from vawm.process import names
+
 MIN_COMPILE_SECONDS = 0.5
 
 
@@ -25,7 +27,7 @@ def folder() -> pathlib.Path:
 
 
 def enable() -> pathlib.Path | None:
-    """Turns the cache on. Warns and leaves it off if its folder cannot be written.
+    """Turns the cache on. Warns and leaves it off if its folder cannot be used.
 
     Returns:
       The folder in use, or None if the cache is off.
@@ -37,10 +39,13 @@ def enable() -> pathlib.Path | None:
         path = folder()
         path.mkdir(parents=True, exist_ok=True)
         if not os.access(path, os.W_OK | os.X_OK):
-            raise PermissionError(f"{path} is not writable")
+            raise PermissionError(f"{names.shown(path)} is not writable")
+        if not names.is_utf8(path):  # JAX would fail at the first compilation
+            raise OSError(f"{names.shown(path)} is not UTF-8")
     except (OSError, RuntimeError) as error:  # RuntimeError: no home to expand "~" to
         remedy = "set JAX_COMPILATION_CACHE_DIR to a writable folder"
         print(f"warning: no compilation cache ({error}); {remedy}", file=sys.stderr)
+        jax.config.update("jax_compilation_cache_dir", None)  # JAX reads the variable itself
         return None
     jax.config.update("jax_compilation_cache_dir", str(path))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", MIN_COMPILE_SECONDS)

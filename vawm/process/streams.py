@@ -1,7 +1,7 @@
 """Lets a process survive the loss of its standard output and standard error.
 
-A run must not fail because the reader of a pipe ended, a terminal was closed or a disk is
-full: its metrics are in its folder.
+A run must not fail because the reader of a pipe ended, a terminal was closed, a disk is full or
+a character cannot be encoded: its metrics are in its folder.
 """
 
 from __future__ import annotations
@@ -26,7 +26,12 @@ class Lasting:
         self._gone, self._lock = False, threading.Lock()
 
     def write(self, text: str) -> int:
-        self._try(self._file.write, text)
+        r"""Writes the text; characters that the file's encoding lacks as `\xe9` or `\udcff`."""
+        try:
+            self._try(self._file.write, text)
+        except UnicodeEncodeError as error:
+            encoded = text.encode(error.encoding, "backslashreplace")
+            self._try(self._file.write, encoded.decode(error.encoding))
         return len(text)
 
     def writelines(self, lines: Iterable[str]) -> None:

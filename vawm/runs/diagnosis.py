@@ -21,6 +21,7 @@ from vawm.runs.reports.tracking import METRICS, Line
 from vawm.types import Array, PyTree
 
 FILE = "diagnosis.json"
+LARGEST = float(np.finfo(np.float32).max)
 
 
 def first_nonfinite(metrics: Mapping[str, Any]) -> str | None:
@@ -42,7 +43,8 @@ def write(
     It has the loss and its value, env steps and updates, the optimiser's choices, the last
     line of metrics with finite losses, and everything that is not finite: metrics of the
     chunk, parameters, and steps in replay or not yet stored, which came from the
-    environments or from the policy.
+    environments or from the policy. It also has the largest reward in replay: beyond what
+    returns can hold in float32, finite rewards are the cause.
 
     Raises:
       OSError: it cannot be written.
@@ -59,6 +61,7 @@ def write(
         "last_finite_line": last_finite_line(logdir),
         "nonfinite_parameters": nonfinite_parameters(state),
         "nonfinite_replay": nonfinite_steps(state),
+        "largest_reward": largest_reward(state),
     }
     path = logdir / FILE
     path.write_text(json.dumps(content, indent=2) + "\n")
@@ -134,9 +137,24 @@ def _nonfinite(steps: PyTree, ago: np.ndarray) -> Iterator[dict[str, Any]]:
         }
 
 
-def advice(state: TrainState) -> str:
-    """One sentence on what to do about a run that stopped at `state`."""
-    first = _first(nonfinite_steps(state))
+def largest_reward(state: TrainState) -> dict[str, Any]:
+    """The finite reward in replay of the largest magnitude, and its environment."""
+    rewards = np.asarray(state.replay.trajectory.reward)
+    sizes = np.where(np.isfinite(rewards), np.abs(rewards), 0.0)
+    env, slot = np.unravel_index(int(np.argmax(sizes)), sizes.shape)
+    return {"environment": int(env), "reward": float(rewards[env, slot])}
+
+
+def advice(state: TrainState, config: Config) -> str:
+    """One sentence on what to do about a run of `config` that stopped at `state`."""
+    first, largest = _first(nonfinite_steps(state)), largest_reward(state)
+    most = LARGEST / config.imagination.discount_horizon
+    if first is None and abs(largest["reward"]) > most:
+        return (
+            f"environment {largest['environment']} gave a reward of {largest['reward']:.3g}: "
+            f"returns, sums of rewards, hold at most {LARGEST:.2g} in float32, so rewards must "
+            f"stay below {most:.2g}; scale the rewards of the environment, and start again"
+        )
     if first is None or _is_action(first):
         return "Start again with a smaller --optimizer.learning-rate or another --seed"
     ago = f"{first['steps_ago'] + 1} steps before the newest"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import pathlib
 from typing import NamedTuple
 
 import jax
@@ -45,7 +44,7 @@ def saved_config(logdir: str | os.PathLike[str]) -> Config:
       InvalidInput: `logdir` is not the folder of a run, or its checkpoints are damaged.
     """
     if checkpoint.latest(logdir) is None:
-        started = run_folder.read_config(pathlib.Path(logdir).expanduser())
+        started = run_folder.read_config(checkpoint.expanded(logdir))
         if started is not None:
             return started
     return checkpoint.find(logdir, ()).manifest.config
@@ -103,7 +102,7 @@ def _refuse_to_lose(logdir: str | os.PathLike[str], started: Config) -> None:
       InvalidInput: a line records a checkpoint, or the metrics reach the env steps of the
         first one.
     """
-    folder = pathlib.Path(logdir).expanduser()
+    folder = checkpoint.expanded(logdir)
     saves = tracking.read(folder / tracking.SAVE_LINES)
     lines = tracking.read(folder / tracking.METRICS) + saves
     reached = max((line["env_steps"] for line in lines), default=0)
@@ -130,7 +129,7 @@ def cut_back(logdir: str | os.PathLike[str], *, env_steps: int, logged: int) -> 
     Raises:
       OSError: a file cannot be written; it is unchanged.
     """
-    folder = pathlib.Path(logdir).expanduser()
+    folder = checkpoint.expanded(logdir)
     damaged = tracking.truncate(folder / tracking.METRICS, logged)
     for name in (tracking.VIDEO_LINES, tracking.SAVE_LINES):
         tracking.truncate(folder / name, env_steps)

@@ -15,12 +15,16 @@ from typing import Any
 
 from vawm.config import Config, as_dict
 from vawm.errors import InvalidInput
+from vawm.process import names
 from vawm.runs.checkpoint import manifest
 
 HELD = (errno.EAGAIN, errno.EACCES)
 NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.EINVAL)
 """Errors of a lock that another process holds, and of file systems without locks."""
 LOCK, CONFIG, REPLACED = "lock", "config.json", "replaced-"
+LONGEST_INSIDE = 200
+"""Bytes of the longest path inside the folder of a run, rounded up: a checkpoint's files, an
+event file with the name of a machine, `replaced-<number>` before either."""
 
 
 def check_new(logdir: pathlib.Path) -> None:
@@ -40,9 +44,10 @@ def check_writable(folder: pathlib.Path, name: str = "logdir") -> None:
     """Refuses a folder that is not writable; `name` is its command-line option.
 
     Raises:
-      InvalidInput: it is not writable; nothing was written.
+      InvalidInput: it is not writable, or its path is too long; nothing was written.
     """
     try:
+        check_length(folder, name)
         nearest = folder.absolute()
         while not nearest.exists():
             nearest = nearest.parent
@@ -51,6 +56,23 @@ def check_writable(folder: pathlib.Path, name: str = "logdir") -> None:
         usable = False
     if not usable:
         remedy = f"is not writable; choose another --{name}"
+        raise InvalidInput(name, str(folder), remedy)
+
+
+def check_length(folder: pathlib.Path, name: str) -> None:
+    """Refuses a folder whose full path leaves no room for the files inside.
+
+    Raises:
+      InvalidInput: a name in it is too long, or all together.
+    """
+    limits = {which: os.pathconf("/", f"PC_{which}_MAX") for which in ("NAME", "PATH")}
+    longest = max(len(os.fsencode(part)) for part in folder.absolute().parts)
+    if longest > limits["NAME"]:
+        remedy = f"has a name of {longest} bytes; use names of at most {limits['NAME']}"
+        raise InvalidInput(name, str(folder), remedy)
+    length, most = len(os.fsencode(folder.absolute())), limits["PATH"] - LONGEST_INSIDE
+    if length > most:
+        remedy = f"is a path of {length} bytes; use one of at most {most}"
         raise InvalidInput(name, str(folder), remedy)
 
 
@@ -100,8 +122,8 @@ def claim(logdir: pathlib.Path, *, say: Callable[[str], None] = print) -> Iterat
             if error.errno not in NO_LOCKS:
                 raise
             say(
-                f"WARNING: the file system of {logdir} has no locks ({error.strerror}); do "
-                "not start a second run in this folder"
+                f"WARNING: the file system of {names.shown(logdir)} has no locks "
+                f"({error.strerror}); do not start a second run in this folder"
             )
         file.truncate(0)
         file.write(f"process {os.getpid()} on {socket.gethostname()}\n")

@@ -11,7 +11,6 @@ import contextlib
 import errno
 import functools
 import pathlib
-import shlex
 import sys
 import time
 from collections.abc import Callable, Mapping
@@ -24,7 +23,7 @@ from vawm.agent import registry
 from vawm.config import Config
 from vawm.envs.protocol import Environment, EnvironmentFailure, HostEnvironment
 from vawm.errors import InvalidInput
-from vawm.process import signals, streams
+from vawm.process import names, signals, streams
 from vawm.runs import budget, checkpoint, diagnosis, run_folder, suites, validate
 from vawm.runs.checkpoint import manifest
 from vawm.runs.reports import backends, tracking, video
@@ -105,7 +104,7 @@ def run(
         the disk is full.
       SaveError: a checkpoint could not be written.
     """
-    logdir = pathlib.Path(logdir).expanduser()
+    logdir = checkpoint.expanded(logdir)
     console = console or rich.console.Console()
     say = functools.partial(console.print, highlight=False, soft_wrap=True, markup=False)
     with contextlib.ExitStack() as stack:
@@ -122,10 +121,11 @@ def run(
             run_folder.write_config(logdir, config)
         else:
             if fresh and (aside := run_folder.put_aside(logdir)):
-                say(f"starting over; moved the old content of {logdir} to {aside}")
+                old, new = names.shown(logdir), names.shown(aside)
+                say(f"starting over; moved the old content of {old} to {new}")
             if resume:
                 run_folder.clear(logdir)
-                say(f"no checkpoint in {logdir} yet; starting from the beginning")
+                say(f"no checkpoint in {names.shown(logdir)} yet; starting from the beginning")
             run_folder.write_config(logdir, config)
             state, progress = trainer.init(config.seed), Progress()
             _refuse_nonfinite(state)
@@ -154,6 +154,7 @@ def check(
       InvalidInput: names field, value and remedy.
     """
     validate.check(config)
+    logdir = checkpoint.expanded(logdir)
     if known_task:
         suites.check_task(config)
     if not resume:  # a resumed run continues even without its tracker
@@ -375,8 +376,8 @@ def _stop(
         saver.wait()
     raise RunError(
         f"{reason} at env_steps={progress.env_steps}; "
-        f"kept: {checkpoint.kept(logdir)}; details in {written}. "
-        f"{diagnosis.advice(state)}"
+        f"kept: {checkpoint.kept(logdir)}; details in {names.shown(written)}. "
+        f"{diagnosis.advice(state, config)}"
     )
 
 
@@ -404,7 +405,7 @@ def _explained(logdir: pathlib.Path):
         full = error.errno == errno.ENOSPC
         free = f" ({checkpoint.free_space(logdir)} free)" if full else ""
         raise RunError(
-            f"{error.filename or logdir}: {error.strerror or error}{free}; "
+            f"{names.shown(str(error.filename or logdir))}: {error.strerror or error}{free}; "
             "fix the cause, then continue with --resume or start again"
         ) from error
 
@@ -425,12 +426,12 @@ def _summarise(
     text = [
         f"{'finished' if finished else 'stopped'} at {result.env_steps} env steps",
         f"episode return: {shown}",
-        f"metrics, TensorBoard events and {saved}: {result.logdir}",
+        f"metrics, TensorBoard events and {saved}: {names.shown(result.logdir)}",
     ]
-    where = f"--logdir {shlex.quote(str(result.logdir))}"
+    where = names.flag("logdir", result.logdir)
     evaluation, resumption = f"python -m vawm.evaluate {where}", f"{command} --resume {where}"
     if plugin := registry.plugin_of(config.agent):
-        words = f" --plugin {shlex.quote(plugin)}"
+        words = " " + names.flag("plugin", plugin)
         evaluation += words
         resumption += (
             "" if pathlib.Path(sys.argv[0]).name == pathlib.Path(plugin).name else words

@@ -10,8 +10,9 @@
         manifest.sha256
     <logdir>/checkpoints/damaged-<env_steps>/     damaged, renamed by a resumed run
 
-A checkpoint is written under a temporary name and renamed when it is complete. Then older ones
-are deleted, except the newest `Config.keep_checkpoints`, so a complete one always exists.
+A checkpoint is written under a temporary name, opened as a restore would, and renamed. Then
+older ones are deleted, except the newest `Config.keep_checkpoints`, so a complete one always
+exists.
 Reading compares checksums first. If the newest checkpoint is damaged, the newest undamaged one
 is used, with a warning.
 
@@ -25,6 +26,7 @@ from vawm.runs.checkpoint.folders import (
     DAMAGED,
     SCRATCH,
     complete,
+    expanded,
     kept,
     latest,
     root,
@@ -59,6 +61,7 @@ __all__ = [
     "Snapshot",
     "Written",
     "complete",
+    "expanded",
     "find",
     "flatten",
     "free_space",

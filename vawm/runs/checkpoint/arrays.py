@@ -1,4 +1,7 @@
-"""Named numpy arrays in a folder, stored by Orbax and compared with the manifest."""
+"""Named numpy arrays in a folder, stored by Orbax and compared with the manifest.
+
+Orbax sees the folder through a path without special characters, see `handle`.
+"""
 
 from __future__ import annotations
 
@@ -6,13 +9,14 @@ import contextlib
 import logging
 import pathlib
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 import jax
 import numpy as np
 import orbax.checkpoint as ocp
 
+from vawm.runs.checkpoint import handle, store
 from vawm.runs.checkpoint.manifest import Damaged, LeafInfo
 
 REGISTRY = ocp.type_handlers.create_type_handler_registry(
@@ -21,38 +25,110 @@ REGISTRY = ocp.type_handlers.create_type_handler_registry(
     (jax.Array, ocp.type_handlers.ArrayHandler()),  # unused; Orbax warns without it
 )
 
+READ_BACK = 64 * 2**20
+"""Bytes of arrays that `check` reads at once."""
+
 
 def write(path: pathlib.Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Writes `arrays`, none of them empty, to the new folder `path`."""
-    with _checkpointer() as checkpointer:
-        checkpointer.save(path, args=ocp.args.PyTreeSave(dict(arrays)))
+    """Writes `arrays`, none of them empty, to the new folder `path`, whose parent exists."""
+    with handle.plain(path.parent) as parent, _checkpointer() as checkpointer:
+        checkpointer.save(parent / path.name, args=ocp.args.PyTreeSave(dict(arrays)))
 
 
 def read(path: pathlib.Path, expected: Mapping[str, LeafInfo]) -> dict[str, np.ndarray]:
     """Reads the arrays in `path`, which must be exactly those expected.
 
-    Compares shapes and dtypes with Orbax's metadata before memory is allocated, because a
+    Compares shapes and dtypes with the stored metadata before memory is allocated, because a
     few bytes can expand to an array of any size.
 
     Raises:
       Damaged: the folder cannot be read, or holds other arrays.
     """
-    try:
+    with _open(path) as folder:
+        if store.unmerged(folder):
+            return store.read_unmerged(path, folder, expected)
         with _checkpointer() as checkpointer:
-            _compare(path, checkpointer.metadata(path).item_metadata.tree, expected)
-            restore_args = {name: ocp.RestoreArgs(restore_type=np.ndarray) for name in expected}
-            arrays = checkpointer.restore(
-                path, args=ocp.args.PyTreeRestore(restore_args=restore_args)
+            _compare(path, checkpointer.metadata(folder).item_metadata.tree, expected)
+            args = ocp.args.PyTreeRestore(restore_args=_as_numpy(expected))
+            arrays = checkpointer.restore(folder, args=args)
+    for name, info in expected.items():
+        if _info(arrays[name]) != info:
+            raise Damaged(path, f"holds {name} with a shape or dtype not in the manifest")
+    return arrays
+
+
+def check(path: pathlib.Path, written: Mapping[str, np.ndarray]) -> None:
+    """Opens what `write` wrote to `path` as `read` would, and compares it with `written`.
+
+    Of every array it compares name, shape and dtype. Arrays up to `READ_BACK` bytes are read
+    and compared bit for bit, a few at a time. Of larger ones, such as replayed images, it only
+    checks that there is data: reading them would take their memory again.
+
+    Raises:
+      Damaged: `read` would refuse it, or would return something else.
+    """
+    infos = {name: _info(array) for name, array in written.items()}
+    with _open(path) as folder, _checkpointer() as checkpointer:
+        _compare(path, checkpointer.metadata(folder).item_metadata.tree, infos)
+        for part in _parts(infos):
+            args = ocp.args.PyTreeRestore(
+                item=dict.fromkeys(part, 0), restore_args=_as_numpy(part), partial_restore=True
             )
+            found = checkpointer.restore(folder, args=args)
+            for name in part:
+                if not _same(found[name], written[name]):
+                    raise Damaged(path, f"holds another {name} than was written")
+        large = [name for name, info in infos.items() if info.nbytes > READ_BACK]
+        store.require_data(path, folder, large)
+
+
+def _parts(infos: Mapping[str, LeafInfo]) -> Iterator[list[str]]:
+    """Names of arrays of at most `READ_BACK` bytes; together no more than that in each part."""
+    part: list[str] = []
+    size = 0
+    for name, info in infos.items():
+        if info.nbytes > READ_BACK:
+            continue
+        if part and size + info.nbytes > READ_BACK:
+            yield part
+            part, size = [], 0
+        part.append(name)
+        size += info.nbytes
+    if part:
+        yield part
+
+
+def _info(array: np.ndarray) -> LeafInfo:
+    return LeafInfo(array.shape, str(array.dtype))
+
+
+def _same(a: np.ndarray, b: np.ndarray) -> bool:
+    """Whether two arrays are equal bit for bit, NaN included."""
+    return _info(a) == _info(b) and bool(np.array_equal(_bits(a), _bits(b)))
+
+
+def _bits(array: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(array).reshape(-1).view(np.uint8)
+
+
+def _as_numpy(names: Iterable[str]) -> dict[str, ocp.RestoreArgs]:
+    return {name: ocp.RestoreArgs(restore_type=np.ndarray) for name in names}
+
+
+@contextlib.contextmanager
+def _open(path: pathlib.Path) -> Iterator[pathlib.Path]:
+    """A plain path to the folder `path`; turns errors inside the block into `Damaged`."""
+    where = ""
+    try:
+        with handle.plain(path) as folder:
+            where = str(folder)
+            yield folder
     except Damaged:
         raise
     except Exception as error:  # Orbax and TensorStore have no error class
-        first = (str(error).strip() or repr(error)).splitlines()[0]
+        text = (str(error).strip() or repr(error)).splitlines()[0]
+        first = text.replace(where, str(path)) if where else text
         raise Damaged(path, f"cannot be read ({first[:200]})") from error
-    for name, info in expected.items():
-        if (arrays[name].shape, str(arrays[name].dtype)) != (info.shape, info.dtype):
-            raise Damaged(path, f"holds {name} with a shape or dtype not in the manifest")
-    return arrays
 
 
 @contextlib.contextmanager

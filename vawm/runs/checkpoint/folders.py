@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pathlib
+import re
 import shutil
 
 from vawm.errors import InvalidInput
@@ -12,9 +13,37 @@ SCRATCH, DAMAGED = "tmp-", "damaged-"
 """Prefixes of the names of incomplete checkpoints and of damaged ones that were renamed."""
 
 
+URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:")
+"""The first part of a URL such as `gs://bucket/run`."""
+
+
+def expanded(path: str | os.PathLike[str], name: str = "logdir") -> pathlib.Path:
+    """`path` with the home of its user for `~`; `name` is the option that it comes from.
+
+    Raises:
+      InvalidInput: it is a URL, names an unknown user, or holds a zero byte.
+    """
+    text = os.fspath(path)
+    if "\0" in text:
+        raise InvalidInput(name, text, "holds a zero byte, which no name of a file can hold")
+    whole = pathlib.Path(text)
+    if len(whole.parts) > 1 and URL.fullmatch(whole.parts[0]) and not whole.exists():
+        remedy = "is a URL; use a folder, such as one where the bucket is mounted"
+        raise InvalidInput(name, text, f"{remedy} (a folder of this name by its full path)")
+    try:
+        return whole.expanduser()
+    except RuntimeError as error:
+        remedy = "names the home of an unknown user; give the full path of the folder"
+        raise InvalidInput(name, text, remedy) from error
+
+
 def root(logdir: str | os.PathLike[str]) -> pathlib.Path:
-    """The folder of all checkpoints of a run."""
-    return pathlib.Path(logdir).expanduser().absolute() / "checkpoints"
+    """The folder of all checkpoints of a run.
+
+    Raises:
+      InvalidInput: see `expanded`.
+    """
+    return expanded(logdir).absolute() / "checkpoints"
 
 
 def folder(logdir: str | os.PathLike[str], env_steps: int) -> pathlib.Path:

@@ -13,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from vawm.errors import InvalidInput
-from vawm.runs.checkpoint import arrays, folders, leaves, manifest
+from vawm.process import names
+from vawm.runs.checkpoint import arrays, folders, leaves, manifest, store
 from vawm.runs.checkpoint.integrity import verify
 from vawm.runs.checkpoint.leaves import Leaves
 from vawm.runs.checkpoint.manifest import EPISODES, Damaged, LeafInfo, Manifest, leaf_info
@@ -35,6 +36,11 @@ class Found(NamedTuple):
     path: pathlib.Path
     manifest: Manifest
     damaged: tuple[tuple[pathlib.Path, Damaged], ...] = ()
+
+    @property
+    def unmerged(self) -> tuple[str, ...]:
+        """Items whose files an earlier version did not merge; they are read all the same."""
+        return tuple(i for i in self.manifest.leaves if store.unmerged(self.path / i))
 
 
 def find(logdir: str | os.PathLike[str], items: Collection[str] | None = None) -> Found:
@@ -70,19 +76,29 @@ def find(logdir: str | os.PathLike[str], items: Collection[str] | None = None) -
 
 
 def warning(found: Found) -> str | None:
-    """One line about damaged checkpoints and the one used instead; None without damage."""
-    if not found.damaged:
-        return None
-    _, error = found.damaged[0]
-    more = f" (and {len(found.damaged) - 1} more)" if len(found.damaged) > 1 else ""
-    return (
-        f"damaged checkpoint{more}: {error.path} {error.how}; "
-        f"using the one at {found.manifest.env_steps} env steps instead"
-    )
+    """One line about damaged checkpoints and the one used instead, and about an incomplete one.
+
+    None if the newest checkpoint is used and complete.
+    """
+    lines = []
+    if found.damaged:
+        _, error = found.damaged[0]
+        more = f" (and {len(found.damaged) - 1} more)" if len(found.damaged) > 1 else ""
+        lines.append(
+            f"damaged checkpoint{more}: {names.shown(error.path)} {error.how}; using "
+            f"the one at {found.manifest.env_steps} env steps instead"
+        )
+    if found.unmerged:
+        items = ", ".join(found.unmerged)
+        lines.append(
+            f"incomplete checkpoint: {names.shown(found.path)}, whose files in "
+            f"{items} an earlier version did not merge; nothing is lost, all is read"
+        )
+    return "; ".join(lines) or None
 
 
 def usable(logdir: str | os.PathLike[str], items: Collection[str] | None = None) -> Found:
-    """`find`; also warns in the log `vawm` if a newer checkpoint is damaged."""
+    """`find`; also logs its `warning` to `vawm`."""
     found = find(logdir, items)
     if line := warning(found):
         logging.getLogger("vawm").warning(line)

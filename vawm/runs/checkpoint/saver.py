@@ -1,7 +1,7 @@
 """Saves checkpoints while training continues.
 
 the loop waits for    the previous save to finish, a copy of the state
-a thread does         write, checksum, rename, delete old ones (without JAX)
+a thread does         write, checksum, read back, rename, delete old ones (without JAX)
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vawm.config import Config
+from vawm.process import names
 from vawm.runs.checkpoint import folders, snapshot, writing
 from vawm.runs.checkpoint.manifest import sync
 from vawm.runs.checkpoint.snapshot import Snapshot
@@ -98,8 +99,8 @@ class Saver:
         self._tell_if_slow(waited=began - due, interval=began - self._last)
         if not folders.root(self.logdir).parent.is_dir():  # a new folder would be overlooked
             raise SaveError(
-                f"no checkpoint was written, because {self.logdir} does not exist any more; "
-                "if it was moved, resume it with --resume --logdir NEW_FOLDER"
+                f"no checkpoint was written, because {names.shown(self.logdir)} does not exist "
+                "any more; if it was moved, resume it with --resume --logdir NEW_FOLDER"
             )
         writing.refuse_backwards(self.logdir, env_steps)
         taken = snapshot.take(

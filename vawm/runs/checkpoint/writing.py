@@ -1,4 +1,4 @@
-"""Writes a checkpoint completely or not at all."""
+"""Writes a checkpoint completely or not at all, and reads it back before it counts."""
 
 from __future__ import annotations
 
@@ -13,8 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vawm.config import Config
+from vawm.errors import InvalidInput
+from vawm.process import names
 from vawm.runs.checkpoint import arrays, folders, manifest, snapshot
-from vawm.runs.checkpoint.manifest import Manifest
+from vawm.runs.checkpoint.manifest import Damaged, Manifest
 from vawm.runs.checkpoint.snapshot import Snapshot
 from vawm.types import EnvSpec, PyTree
 
@@ -63,9 +65,12 @@ def write(logdir: str | os.PathLike[str], taken: Snapshot) -> Written:
 
     Does not use JAX, so any thread may call it, but only one at a time.
 
+    Before the checkpoint gets its name and an older one is deleted, it is opened as a restore
+    would open it, and compared with the snapshot: see `_check`.
+
     Raises:
-      SaveError: nothing was changed, because the disk is full, a parameter is not finite, or
-        a checkpoint at these or later env steps exists.
+      SaveError: nothing was changed, because the disk is full, the files cannot be read back,
+        a parameter is not finite, or a checkpoint at these or later env steps exists.
     """
     final = folders.folder(logdir, taken.env_steps)
     refuse_backwards(logdir, taken.env_steps)
@@ -78,6 +83,7 @@ def write(logdir: str | os.PathLike[str], taken: Snapshot) -> Written:
             for item in taken.leaves:
                 arrays.write(scratch / item, taken.arrays[item])
             nbytes = manifest.write(scratch, _manifest(taken))
+            _check(scratch, taken)
             scratch.rename(final)
             manifest.sync(final.parent)
         except Exception as error:
@@ -89,6 +95,22 @@ def write(logdir: str | os.PathLike[str], taken: Snapshot) -> Written:
     return Written(final, nbytes)
 
 
+def _check(scratch: pathlib.Path, taken: Snapshot) -> None:
+    """Opens a checkpoint that was just written, as a restore would.
+
+    Reads its manifest with all limits on what a checkpoint may hold, and its arrays, see
+    `arrays.check`. The checksums were computed from the same files and are not computed again.
+
+    Raises:
+      InvalidInput: a restore would refuse it, or would return something else.
+    """
+    found = manifest.read(scratch)
+    if found.leaves != taken.leaves:
+        raise Damaged(scratch / manifest.NAME, "lists other leaves than were written")
+    for item, written in taken.arrays.items():
+        arrays.check(scratch / item, written)
+
+
 def refuse_backwards(logdir: str | os.PathLike[str], env_steps: int) -> None:
     """Refuses to save at or before the env steps of the newest checkpoint.
 
@@ -97,9 +119,10 @@ def refuse_backwards(logdir: str | os.PathLike[str], env_steps: int) -> None:
     """
     newest = folders.latest(logdir)
     if newest is not None and env_steps <= int(newest.name):
+        path = names.shown(folders.folder(logdir, env_steps))
         raise SaveError(
-            f"checkpoint {folders.folder(logdir, env_steps)} was not written, because a newer "
-            f"one exists, at {int(newest.name)} env steps"
+            f"checkpoint {path} was not written, because a newer one exists, at "
+            f"{int(newest.name)} env steps"
         )
 
 
@@ -129,11 +152,19 @@ def _refuse_nonfinite(needed: Mapping[str, np.ndarray]) -> None:
 def _why_not_saved(
     logdir: str | os.PathLike[str], final: pathlib.Path, needed: int, error: Exception
 ) -> str:
+    path = names.shown(final)
+    if isinstance(error, InvalidInput):
+        how = f"{error.path.name} {error.how}" if isinstance(error, Damaged) else error.remedy
+        return (
+            f"checkpoint {path} was removed, because it could not be read back: {how[:200]}; "
+            f"kept: {folders.kept(logdir)}; check the disk, or copy the run to another, then "
+            "continue with --resume"
+        )
     reason = (str(error).strip() or repr(error)).splitlines()[0]
     # TensorStore lists files before the system's error, and its own options after it.
     reason = re.split(r" \[\w+='", reason)[0].rpartition('": ')[-1]
     return (
-        f"checkpoint {final} could not be written (up to {amount(needed)} needed, "
+        f"checkpoint {path} could not be written (up to {amount(needed)} needed, "
         f"{free_space(final.parents[1])} free): {reason[:200]}; kept: {folders.kept(logdir)}; "
         "fix the cause, then continue with --resume"
     )

@@ -193,7 +193,7 @@ class Board:
 
     def __init__(self, logdir: pathlib.Path, *, purge_after: int | None = None):
         name = f"events.out.tfevents.{time.time():.6f}.{socket.gethostname()}"
-        self._file = RecordWriter(str(logdir / name))
+        self._file = RecordWriter(str((logdir / name).absolute()))  # `s3:x` is a folder
         self._add(Event(file_version="brain.Event:2"))
         if purge_after is not None:
             start = SessionLog(status=SessionLog.START)
