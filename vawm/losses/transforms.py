@@ -1,7 +1,8 @@
 """Symlog, the two-hot code over symexp-spaced bins, and categorical arithmetic.
 
 The bins reach +-4.85e8 and are exactly symmetric, and sums over them are arranged such that
-symmetric terms cancel exactly. Everything is computed in float32, whatever the logits' dtype.
+symmetric terms cancel exactly. Everything is computed in the dtype of the logits, but never in
+less than float32; see `at_least_float32`.
 """
 
 from __future__ import annotations
@@ -15,6 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 
 Array = jax.Array
+
+
+def at_least_float32(x: Array) -> Array:
+    """`x` in float64 if it is that already, as under `jax_enable_x64`; else in float32."""
+    return x.astype(jnp.float64 if x.dtype == jnp.float64 else jnp.float32)
 
 
 def symlog(x: Array) -> Array:
@@ -99,12 +105,13 @@ def make_two_hot(n: int, spacing: Literal["symexp", "symlog"]) -> TwoHot:
     if spacing == "symexp":
         bins = symexp_bins(n)
         return TwoHot(bins, lambda y: y, lambda logits: two_hot_mean(logits, bins))
-    bins = jnp.linspace(-20.0, 20.0, n)
+    bins = jnp.linspace(-20.0, 20.0, n, dtype=jnp.float32)
 
     def mean(logits: Array) -> Array:
         # Not a matrix product, which accelerators would round to fewer bits.
-        probs = jax.nn.softmax(logits.astype(jnp.float32))
-        return symexp((probs * jnp.expand_dims(bins, tuple(range(logits.ndim - 1)))).sum(-1))
+        probs = jax.nn.softmax(at_least_float32(logits))
+        values = jnp.expand_dims(bins.astype(probs.dtype), tuple(range(logits.ndim - 1)))
+        return symexp((probs * values).sum(-1))
 
     return TwoHot(bins, symlog, mean)
 
@@ -115,9 +122,10 @@ def two_hot(y: Array, bins: Array) -> Array:
     Weights are linear in raw distance; a `y` beyond the ends is put on the end bin. Losses do
     not build this array: see `two_hot_cross_entropy`.
     """
-    below, above, share = _neighbours(y, bins)
+    below, above, share = _neighbours(at_least_float32(y), bins)
     n, share = bins.shape[0], share[..., None]
-    return (1 - share) * jax.nn.one_hot(below, n) + share * jax.nn.one_hot(above, n)
+    below, above = (jax.nn.one_hot(index, n, dtype=share.dtype) for index in (below, above))
+    return (1 - share) * below + share * above
 
 
 def two_hot_mean(logits: Array, bins: Array) -> Array:
@@ -135,10 +143,10 @@ def two_hot_mean(logits: Array, bins: Array) -> Array:
     """
     chex.assert_equal(logits.shape[-1:], bins.shape)
     half = bins.shape[0] // 2
-    logits = logits.astype(jnp.float32)
+    logits = at_least_float32(logits)
     exp = jnp.exp(logits - jax.lax.stop_gradient(logits.max(-1, keepdims=True)))
     odd = exp[..., -half:] - exp[..., :half][..., ::-1]
-    upper = jnp.expand_dims(bins[-half:], tuple(range(logits.ndim - 1)))
+    upper = jnp.expand_dims(bins[-half:].astype(logits.dtype), tuple(range(logits.ndim - 1)))
     return (odd * upper).sum(-1) / exp.sum(-1)
 
 
@@ -187,12 +195,14 @@ def two_hot_cross_entropies(
       AssertionError: the shapes do not fit each other.
     """
     chex.assert_equal(logits.shape[-1:], bins.shape)
-    logits = logits.astype(jnp.float32)
+    logits = at_least_float32(logits)
     normalizer = jax.nn.logsumexp(logits, axis=-1)
     chex.assert_equal_shape([normalizer, *targets])
 
     def score(target):
-        below, above, share = _neighbours(jax.lax.stop_gradient(target), bins)
+        below, above, share = _neighbours(
+            jax.lax.stop_gradient(target).astype(logits.dtype), bins
+        )
         return (1 - share) * _pick(logits, below) + share * _pick(logits, above)
 
     return tuple(normalizer - score(target) for target in targets)
@@ -200,7 +210,7 @@ def two_hot_cross_entropies(
 
 def unimix_logits(logits: Array, unimix: float) -> Array:
     """log((1 - u) * softmax(logits) + u / K): normalised, each class at least u / K."""
-    log_prob = jax.nn.log_softmax(logits.astype(jnp.float32))
+    log_prob = jax.nn.log_softmax(at_least_float32(logits))
     if unimix == 0:
         return log_prob
     return jnp.log((1 - unimix) * jnp.exp(log_prob) + unimix / logits.shape[-1])
@@ -216,27 +226,28 @@ def categorical_kl(p_logits: Array, q_logits: Array) -> Array:
       q_logits: `[..., K]`, normalised or not.
 
     Returns:
-      `[...]` in nats, in float32; exactly 0 for equal finite logits. Nothing is stopped.
+      `[...]` in nats; exactly 0 for equal finite logits. Nothing is stopped.
 
     Raises:
       AssertionError: the shapes differ.
     """
     chex.assert_equal_shape([p_logits, q_logits])
-    log_p = jax.nn.log_softmax(p_logits.astype(jnp.float32))
-    log_q = jax.nn.log_softmax(q_logits.astype(jnp.float32))
+    log_p = jax.nn.log_softmax(at_least_float32(p_logits))
+    log_q = jax.nn.log_softmax(at_least_float32(q_logits))
     return (jnp.exp(log_p) * (log_p - log_q)).sum(-1)
 
 
 def categorical_entropy(logits: Array) -> Array:
     """Entropy of softmax(logits) in nats, over the last axis."""
-    log_prob = jax.nn.log_softmax(logits.astype(jnp.float32))
+    log_prob = jax.nn.log_softmax(at_least_float32(logits))
     return -(jnp.exp(log_prob) * log_prob).sum(-1)
 
 
 def _neighbours(y: Array, bins: Array) -> tuple[Array, Array, Array]:
     """Indices of the bins below and above `y`, and the weight of the one above."""
     # Clipping keeps NaN, and the weight becomes NaN: a broken target is not hidden.
-    y = jnp.clip(y.astype(jnp.float32), bins[0], bins[-1])
+    bins = bins.astype(y.dtype)
+    y = jnp.clip(y, bins[0], bins[-1])
     after = jnp.searchsorted(bins, y, side="right")
     last = bins.shape[0] - 1
     below, above = jnp.clip(after - 1, 0, last), jnp.clip(after, 0, last)

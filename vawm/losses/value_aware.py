@@ -10,6 +10,8 @@ import chex
 import jax
 import jax.numpy as jnp
 
+from .transforms import at_least_float32
+
 Array = jax.Array
 
 
@@ -119,8 +121,9 @@ def categorical_iter_vaml_loss(prediction_logits: Array, target_logits: Array) -
       AssertionError: the shapes differ.
     """
     chex.assert_equal_shape([prediction_logits, target_logits])
-    target = jax.nn.softmax(jax.lax.stop_gradient(target_logits).astype(jnp.float32))
-    return -(target * jax.nn.log_softmax(prediction_logits.astype(jnp.float32))).sum(-1)
+    log_prob = jax.nn.log_softmax(at_least_float32(prediction_logits))
+    target_logits = jax.lax.stop_gradient(target_logits).astype(log_prob.dtype)
+    return -(jax.nn.softmax(target_logits) * log_prob).sum(-1)
 
 
 def _deviations(prediction_values: Array, target_value: Array) -> Array:
