@@ -23,7 +23,6 @@ import jax
 from vawm import envs
 from vawm.cli import flags
 from vawm.cli.command_line import guard
-from vawm.config import Config
 from vawm.envs.protocol import Environment, HostEnvironment, check_positive
 from vawm.errors import InvalidInput
 from vawm.policy import Policy, load, play, scores
@@ -115,7 +114,7 @@ def by_protocol(
 
     Raises:
       InvalidInput: a number is out of range, the protocol does not have this option, or the
-        policy was trained in an environment that its config does not name.
+        policy was trained in environments that only the caller can make.
       EnvironmentFailure: an environment on the host failed.
     """
     protocol = suites.of(policy.config).protocol
@@ -123,10 +122,11 @@ def by_protocol(
     check(episodes, seed)
     check_options(policy.config.suite, physics=physics, **choices)
     if physics == "mujoco":
+        suites.check_made(policy.spec.made, python=in_python(episodes))
         envs.check_task(policy.spec.task)
         return play.in_mujoco(policy, episodes=episodes, seed=seed, how=how)
     changes = {**protocol.changes, **choices}
-    with environments(policy.config, episodes, **changes) as env:
+    with environments(policy, episodes, **changes) as env:
         if env.spec.task != policy.spec.task:
             remedy = f"is not the config's task, {env.spec.task}; use evaluate(..., env=...)"
             raise InvalidInput("task", policy.spec.task, remedy)
@@ -149,25 +149,40 @@ def check_options(suite: str, *, physics: str | None = None, **choices: Any) -> 
 
 @contextlib.contextmanager
 def environments(
-    config: Config, episodes: int, **changes: Any
+    policy: Policy, episodes: int, **changes: Any
 ) -> Iterator[Environment | HostEnvironment]:
-    """The environments of a run, as many as `episodes` need; on the host at most `AT_ONCE`.
+    """The environments a policy was trained in, as many as `episodes` need, but on the host at
+    most `AT_ONCE`.
 
     Args:
-      config: of the run.
+      policy: as `vawm.load` returns it.
       episodes: how many will be played.
       **changes: choices of the environments that differ from those of training.
+
+    Raises:
+      InvalidInput: they were made by code of the caller's; names the two lines of Python.
     """
     num_envs = episodes
-    if suites.host_choices(config) is not None:
+    if suites.host_choices(policy.config) is not None:
         num_envs, changes = min(episodes, AT_ONCE), changes | {"on_failure": "raise"}
-    choices = dataclasses.replace(config.env, **changes)
-    env = suites.make(dataclasses.replace(config, num_envs=num_envs, env=choices))
+    env = suites.make_again(
+        dataclasses.replace(policy.config, num_envs=num_envs),
+        policy.spec.made,
+        task=policy.spec.task,
+        python=in_python(episodes),
+        **changes,
+    )
     try:
         yield env
     finally:
         if not isinstance(env, Environment):
             env.close()
+
+
+def in_python(episodes: int) -> str:
+    """The statements that evaluate a policy in environments of the caller's."""
+    load = "policy = vawm.load(LOGDIR)"
+    return f"{load}; vawm.evaluate.evaluate(policy, episodes={episodes}, env=...)"
 
 
 @dataclasses.dataclass(frozen=True)

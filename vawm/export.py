@@ -27,6 +27,7 @@ from vawm.agent import parameter_count, registry
 from vawm.cli import flags
 from vawm.cli.command_line import guard
 from vawm.config import Config
+from vawm.envs import made as records
 from vawm.errors import InvalidInput
 from vawm.policy import Policy, load, weights
 from vawm.policy.play import Score
@@ -44,9 +45,9 @@ USAGE = f"""{LOAD}\
 env = vawm.envs.make(policy.spec.task, num_envs=1, action_repeat=policy.spec.action_repeat)
 _, timestep = env.reset(jax.random.key(0))
 carry, action = policy.act(jax.random.key(1), policy.initial(1), timestep)"""
-HOST_USAGE = f"""from vawm.runs import suites
+HOST_USAGE = f"""import vawm.evaluate
 {LOAD}\
-with suites.make(policy.config) as env:  # as in training, in separate processes
+with vawm.evaluate.environments(policy, episodes=1) as env:  # as in training
     carry, timestep = policy.initial(env.spec.num_envs), env.reset(0)
     carry, action = policy.act(jax.random.key(1), carry, timestep)"""
 OWN_USAGE = f"""{LOAD}\
@@ -119,7 +120,7 @@ def _last_return(logdir: pathlib.Path, env_steps: int) -> str:
 
 def card(policy: Policy, measured: str) -> str:
     """The text of `README.md`; `measured` is the sentence about the policy's score."""
-    config, spec = policy.config, policy.spec
+    config, spec, made = policy.config, policy.spec, policy.spec.made
     plugin = registry.plugin_of(config.agent)
     file = names.shown(pathlib.Path(plugin).name) if plugin else ""
     evaluation = "python -m vawm.evaluate --logdir FOLDER"
@@ -127,6 +128,7 @@ def card(policy: Policy, measured: str) -> str:
         evaluation += f" --plugin {file}"
     rows = {
         "task": f"{spec.task} ({config.suite})",
+        "environment": "as the task's name says" if made is None else records.describe(made),
         "agent": config.agent + (f", registered by {file}: import it first" if file else ""),
         "size": f"{config.size}, {parameter_count(policy.params):,} parameters",
         "preset": config.preset,
@@ -170,11 +172,14 @@ Apache-2.0, as vawm.
 
 def _usage(policy: Policy) -> str:
     """The lines that load the policy and act once."""
-    config = policy.config
-    try:  # the task of the spec: the config's says nothing about a user's environment
+    config, made = policy.config, policy.spec.made
+    if not records.can_be_made_again(made):
+        return OWN_USAGE
+    try:  # of an earlier version: its spec names the task, its config another environment
         suites.check_task(dataclasses.replace(config, task=policy.spec.task))
     except InvalidInput:
-        return OWN_USAGE
+        if made is None:
+            return OWN_USAGE
     return USAGE if suites.host_choices(config) is None else HOST_USAGE
 
 

@@ -46,6 +46,27 @@ def is_image(obs: Any) -> bool:
     return obs.dtype == jnp.uint8
 
 
+class Made(NamedTuple):
+    """How the environments of a run were made, so that commands can make the same again.
+
+    Attributes:
+      by: the name of a suite, whose environments can be made again; or "object", a function, a
+        class or an object of the caller's.
+      name: the task or registered id; of an object its qualified name.
+      options: what was chosen beside it, such as a time limit; values that JSON has.
+      kwargs: keyword arguments of the environment itself; values that JSON has.
+      opaque: other keyword arguments -> their `repr`. They cannot be made again.
+      wrappers: those that a registered id comes with, the innermost first.
+    """
+
+    by: str
+    name: str
+    options: dict[str, Any] = {}  # noqa: RUF012 - never mutated
+    kwargs: dict[str, Any] = {}  # noqa: RUF012
+    opaque: dict[str, str] = {}  # noqa: RUF012
+    wrappers: tuple[str, ...] = ()
+
+
 class EnvSpec(NamedTuple):
     """What an agent must know about an environment; all static.
 
@@ -58,6 +79,7 @@ class EnvSpec(NamedTuple):
       num_envs: N, environments that are stepped together.
       action_repeat: control steps per call of `step`.
       episode_length: calls of `step` in a full episode; None if it varies.
+      made: how they were made; the runner fills it in. None in runs of earlier versions.
     """
 
     task: str
@@ -67,6 +89,7 @@ class EnvSpec(NamedTuple):
     num_envs: int
     action_repeat: int
     episode_length: int | None
+    made: Made | None = None
 
 
 class TimeStep(NamedTuple):

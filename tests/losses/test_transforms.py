@@ -330,3 +330,40 @@ def test_the_mean_of_a_symlog_code_is_float32_whatever_the_logits_are():
     actual = transforms.make_two_hot(41, "symlog").mean(jnp.zeros((2, 41), jnp.bfloat16))
     assert actual.dtype == jnp.float32
     np.testing.assert_allclose(actual, [0.0, 0.0], atol=1e-5)
+
+
+def test_float64_stays_float64_and_is_more_exact():
+    """Under x64 the losses follow the dtype of the logits, not that of bins and targets."""
+    rng = np.random.default_rng(0)
+    with jax.enable_x64(True):
+        p, q = (jnp.asarray(rng.normal(size=(3, 41))) for _ in range(2))
+        code = transforms.make_two_hot(41, "symexp")
+        target = jnp.asarray(rng.normal(size=3), jnp.float32)
+        wide = (
+            transforms.categorical_kl(p, q),
+            transforms.two_hot_cross_entropy(p, target, code.bins),
+            code.mean(p),
+            transforms.make_two_hot(41, "symlog").mean(p),
+            transforms.unimix_logits(p, 0.01),
+            transforms.categorical_entropy(p),
+            transforms.two_hot(target.astype("float64"), code.bins),
+        )
+        narrow = transforms.categorical_kl(p.astype("float32"), q.astype("float32"))
+        assert {x.dtype for x in wide} == {np.dtype("float64")}
+        assert narrow.dtype == np.float32
+        assert (wide[0] != narrow).any()
+        np.testing.assert_allclose(wide[0], narrow, rtol=1e-5)
+        np.testing.assert_allclose(
+            wide[1], numpy_cross_entropy(p, target, code.bins), rtol=1e-12
+        )
+
+
+def numpy_cross_entropy(logits, target, bins):
+    logits, target, bins = (np.asarray(x, np.float64) for x in (logits, target, bins))
+    code = np.zeros(logits.shape)
+    for row, y in enumerate(target):
+        above = np.searchsorted(bins, y, side="right")
+        share = (y - bins[above - 1]) / (bins[above] - bins[above - 1])
+        code[row, above - 1], code[row, above] = 1 - share, share
+    log_prob = logits - np.log(np.exp(logits).sum(-1, keepdims=True))
+    return -(code * log_prob).sum(-1)

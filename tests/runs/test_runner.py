@@ -130,6 +130,7 @@ def test_a_run_leaves_its_config_a_checkpoint_and_advice(tmp_path, fake):
     console = quiet()
     result = run(tiny.CONFIG, tmp_path, console=console)
     assert result == runner.Result(tmp_path, 96, 0)
+    assert result.stopped_by is None
     assert json.loads((tmp_path / "config.json").read_text())["config"]["env_steps"] == 96
     assert checkpoint.latest(tmp_path).name == "000000000096"
     # The advice for an environment that is not registered.
@@ -607,7 +608,8 @@ def test_a_run_with_a_signal_in_its_last_chunk_is_finished(tmp_path, fake):
 
     fake(loss)
     console = quiet()
-    assert run(tiny.CONFIG, tmp_path, console=console).exit_code == 130
+    result = run(tiny.CONFIG, tmp_path, console=console)
+    assert (result.exit_code, result.stopped_by) == (130, signal.SIGINT)
     text = console.file.getvalue()
     assert "finished at 96 env steps" in text
     assert "vawm.runs.runner.run(config" in text

@@ -46,7 +46,7 @@ class Agent(NamedTuple):
         """The carry before the first observation."""
         return PolicyCarry(
             memory=self.world_model.initial(batch_size),
-            action=jnp.zeros((batch_size, self.spec.action_size)),
+            action=jnp.zeros((batch_size, self.spec.action_size), jnp.float32),
         )
 
     def act(
@@ -93,10 +93,10 @@ class Agent(NamedTuple):
         """A uniformly random action: one of all choices, or numbers in [-1, 1]."""
         shape = (*timestep.is_last.shape, self.spec.action_size)
         if self.spec.discrete:
-            chosen = jax.random.randint(key, shape[:-1], 0, shape[-1])
-            action = jax.nn.one_hot(chosen, shape[-1])
+            chosen = jax.random.randint(key, shape[:-1], 0, shape[-1], jnp.int32)
+            action = jax.nn.one_hot(chosen, shape[-1], dtype=jnp.float32)
         else:
-            action = jax.random.uniform(key, shape, minval=-1.0, maxval=1.0)
+            action = jax.random.uniform(key, shape, jnp.float32, -1.0, 1.0)
         return jnp.where(timestep.is_last[:, None], 0.0, action)
 
 

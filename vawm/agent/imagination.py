@@ -53,6 +53,6 @@ def imagine(
 
     room = jax.tree.map(lambda x: jnp.zeros((horizon + 1, *x.shape), x.dtype), start)
     latents = jax.tree.map(lambda all, x: all.at[0].set(x), room, start)
-    steps = jnp.arange(horizon), jax.random.split(key, horizon)
+    steps = jnp.arange(horizon, dtype=jnp.int32), jax.random.split(key, horizon)
     (_, _, latents), action = jax.lax.scan(step, (carry, start, latents), steps)
     return jax.lax.stop_gradient(Imagined(latents, action))

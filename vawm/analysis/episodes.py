@@ -59,7 +59,7 @@ def record(policy: Policy, *, episodes: int, seed: int, how: How = "sample") -> 
       EnvironmentFailure: an environment on the host failed.
     """
     evaluate.check(episodes, seed)
-    with evaluate.environments(policy.config, episodes) as env:
+    with evaluate.environments(policy, episodes) as env:
         return record_in(env, policy, episodes=episodes, seed=seed, how=how)
 
 

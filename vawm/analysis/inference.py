@@ -100,7 +100,7 @@ def make_prior(agent: Agent) -> Callable[..., Array] | None:
         flag = jnp.zeros((size, 2), bool)
         steps = Trajectory(
             obs=jax.tree.map(blank, spec.obs),  # the prior does not depend on it
-            reward=jnp.zeros((size, 2)),
+            reward=jnp.zeros((size, 2), jnp.float32),
             is_first=flag,
             is_last=flag,
             is_terminal=flag,

@@ -1,1 +1,11 @@
 """The command line of programs."""
+
+import sys
+
+from vawm.errors import InvalidInput
+
+try:
+    import vawm.nets.distributions  # noqa: F401
+except InvalidInput as error:  # this Python cannot run anything; `guard` is not imported yet
+    print(f"error: {error}", file=sys.stderr)
+    sys.exit(2)

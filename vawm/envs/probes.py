@@ -75,7 +75,7 @@ def make(name: str, *, num_envs: int, episode_length: int = 4) -> Environment:
             steps=steps,
             key=jax.random.split(key, num_envs),
         )
-        return state, arrive(state, jnp.zeros(num_envs), jnp.ones(num_envs, bool))
+        return state, arrive(state, jnp.zeros(num_envs, jnp.float32), jnp.ones(num_envs, bool))
 
     def step(state: EnvState, action: Array) -> tuple[EnvState, TimeStep]:
         chex.assert_shape(action, (num_envs, action_size))
@@ -96,8 +96,9 @@ def make(name: str, *, num_envs: int, episode_length: int = 4) -> Environment:
 
     def arrive(state: EnvState, reward: Array, is_first: Array) -> TimeStep:
         is_last = state.steps == episode_length
+        clock = state.steps.astype(jnp.float32) / episode_length
         return TimeStep(
-            obs=jnp.stack([state.data, state.steps / episode_length], axis=-1),
+            obs=jnp.stack([state.data, clock], axis=-1),
             reward=reward,
             is_first=is_first,
             is_last=is_last,
@@ -158,7 +159,7 @@ def known_value(
 def optimal_action(name: str, target: Array) -> Array:
     """The best action `[N, action_size]` for `EnvState.target`."""
     if name.endswith("discrete"):
-        return jax.nn.one_hot((target > 0).astype(jnp.int32), 2)
+        return jax.nn.one_hot((target > 0).astype(jnp.int32), 2, dtype=jnp.float32)
     return target[:, None] / 2
 
 
@@ -172,7 +173,8 @@ def check_probe(name: str) -> None:
 
 def random_signal(key: Key, num_envs: int) -> Array:
     """`[N]` random signals, -1 or 1 with equal probability."""
-    return jax.random.rademacher(key, (num_envs,), jnp.float32)
+    heads = jax.random.bernoulli(key, jnp.float32(0.5), (num_envs,))
+    return 2 * heads.astype(jnp.float32) - 1
 
 
 def visible(kind: str, signal: Array, steps: Array) -> Array:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from vawm.errors import InvalidInput
-from vawm.types import Array, EnvSpec, Key, TimeStep
+from vawm.types import Array, EnvSpec, Key, Made, TimeStep
 
 
 class EnvState(NamedTuple):
@@ -56,10 +56,12 @@ class HostEnvironment(Protocol):
     Attributes:
       spec: what an agent has to know; static.
       restarts: number of restarts after a failure so far.
+      made: how they were made; may be missing, if nobody says so.
     """
 
     spec: EnvSpec
     restarts: int
+    made: Made | None
 
     def reset(self, seed: int) -> TimeStep:
         """Starts the first episode of all N environments."""

@@ -83,16 +83,16 @@ def arrive(
     ended = timestep.is_last
     exchanged = timestep.obs, timestep.reward, collector.carry.action
     metrics = {
-        "episode/count": jnp.sum(ended),
+        "episode/count": jnp.sum(ended, dtype=jnp.int32),
         "episode/return": jnp.sum(jnp.where(ended, episode_return, 0.0)),
-        "episode/length": jnp.sum(jnp.where(ended, episode_length, 0)),
-        "chunk/nonfinite": jnp.sum(~is_finite(exchanged)),
+        "episode/length": jnp.sum(jnp.where(ended, episode_length, 0), dtype=jnp.int32),
+        "chunk/nonfinite": jnp.sum(~is_finite(exchanged), dtype=jnp.int32),
     }
     return Collector(
         env_state=collector.env_state,
         timestep=timestep,
         carry=collector.carry,
-        env_steps=collector.env_steps + action_repeat * jnp.sum(moved),
+        env_steps=collector.env_steps + action_repeat * jnp.sum(moved, dtype=jnp.int32),
         episode_return=episode_return,
         episode_length=episode_length,
     ), metrics
@@ -110,6 +110,13 @@ def is_finite(exchanged: PyTree) -> Array:
     return functools.reduce(jnp.logical_and, map(per_env, floating), start)
 
 
+def in_float32(timestep: TimeStep) -> TimeStep:
+    """`timestep`, in float32 what an environment computes in float64 under `jax_enable_x64`."""
+    return jax.tree.map(
+        lambda x: x.astype(jnp.float32) if x.dtype == jnp.float64 else x, timestep
+    )
+
+
 def make_collect(env: Environment, agent: Agent, config: Config) -> Collect:
     """Build `collect(params, model_state, collector, replay, key)`: K steps per environment.
 
@@ -121,12 +128,14 @@ def make_collect(env: Environment, agent: Agent, config: Config) -> Collect:
             agent, params, model_state, collector, key, random_steps=config.random_steps
         )
         env_state, timestep = env.step(collector.env_state, stored.trajectory.action)
+        timestep = in_float32(timestep)
         collector, metrics = arrive(
             collector._replace(env_state=env_state),
             timestep,
             action_repeat=env.spec.action_repeat,
         )
-        metrics["env/nonfinite"] = jnp.sum(timestep.is_last & (env_state.steps < 0))
+        failed = timestep.is_last & (env_state.steps < 0)
+        metrics["env/nonfinite"] = jnp.sum(failed, dtype=jnp.int32)
         return collector, (stored, metrics)
 
     def collect(
@@ -138,7 +147,7 @@ def make_collect(env: Environment, agent: Agent, config: Config) -> Collect:
         )
         trajectory, latent = jax.tree.map(lambda x: x.swapaxes(0, 1), stored)
         buffer = replay.add(buffer, trajectory, latent)
-        return collector, buffer, jax.tree.map(jnp.sum, metrics)
+        return collector, buffer, jax.tree.map(lambda x: jnp.sum(x, dtype=x.dtype), metrics)
 
     return collect
 
@@ -150,6 +159,6 @@ def begin(agent: Agent, timestep: TimeStep, env_state: PyTree, *, num_envs: int)
         timestep=timestep,
         carry=agent.initial(num_envs),
         env_steps=jnp.zeros((), jnp.int32),
-        episode_return=jnp.zeros(num_envs),
+        episode_return=jnp.zeros(num_envs, jnp.float32),
         episode_length=jnp.zeros(num_envs, jnp.int32),
     )

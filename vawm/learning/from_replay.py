@@ -116,7 +116,7 @@ def make_learn(agent: Agent, config: Config) -> Learn:
     """Build `learn(learner, replay, key, env_steps, due) -> (learner, replay, metrics)`.
 
     It makes `due` updates, each on sequences of its own. Their latents are written back before
-    the next sequences are drawn. Metrics are means over the updates, NaN if there are none.
+    the next sequences are drawn. Metrics are means over the updates, 0 if there are none.
     """
     # Jitted, so that `eval_shape` and the loop share one trace.
     update_at = jax.jit(make_update_at(agent, config))
@@ -140,6 +140,7 @@ def make_learn(agent: Agent, config: Config) -> Learn:
 
         state = learner, buffer, key, sums
         learner, buffer, _, sums = jax.lax.fori_loop(0, due, one_update, state)
-        return learner, buffer, jax.tree.map(lambda x: x / due, sums)
+        updates = jnp.maximum(due, 1).astype(jnp.float32)  # no division by 0
+        return learner, buffer, jax.tree.map(lambda x: x / updates, sums)
 
     return learn

@@ -13,7 +13,6 @@ times slower inside a loop.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -271,7 +270,7 @@ def _images(spec: EnvSpec, config: Config) -> from_replay.Draw:
 
 
 def _mean(learned: list[Metrics], names: tuple[str, ...]) -> dict[str, float]:
-    """Means over the updates of a chunk; NaN if there were none."""
+    """Means over the updates of a chunk; 0 if there were none."""
     if len(learned) == 0:
-        return dict.fromkeys(names, math.nan)
+        return dict.fromkeys(names, 0.0)
     return {name: float(np.mean([m[name] for m in learned])) for name in names}

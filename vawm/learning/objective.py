@@ -170,7 +170,8 @@ def make_behaviour_loss(agent: Agent, config: Config) -> BehaviourLoss:
         logits = critic.logits(params.critic, latent)[:, :-1]
         slow_logits = critic.logits(learner.slow_critic, jax.lax.stop_gradient(latent))[:, :-1]
         slow_value = critic.code.mean(slow_logits)
-        return (1.0 - steps.is_last[:, :-1]) * critic_loss(logits, slow_value, target)
+        goes_on = 1.0 - steps.is_last[:, :-1].astype(jnp.float32)
+        return goes_on * critic_loss(logits, slow_value, target)
 
     def behaviour_loss(
         params: Params,

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import optax
 
 from vawm.config import AdamConfig, LaPropConfig, OptimizerConfig
+from vawm.process import dtypes
 from vawm.types import Params, PyTree
 
 
@@ -108,10 +109,24 @@ def make_adams(config: AdamConfig) -> Adams:
 def make_optimizer(config: OptimizerConfig) -> Optimizer:
     """One optimiser for all parameters, or one for the world model and one for the rest."""
     if isinstance(config, LaPropConfig):
-        return make_laprop(config)
+        return with_usual_dtypes(make_laprop(config))
     if isinstance(config, AdamConfig):
-        return make_adams(config)
+        return Adams(*map(with_usual_dtypes, make_adams(config)))
     raise TypeError(f"no optimiser for {type(config).__name__}")
+
+
+def with_usual_dtypes(optimizer: optax.GradientTransformation) -> optax.GradientTransformation:
+    """`optimizer` under JAX's usual rules for dtypes, whatever this process has set.
+
+    optax computes bias corrections from its int32 counts and Python's floats: in float64 under
+    `jax_enable_x64`, and not at all under `jax_numpy_dtype_promotion=strict`.
+    """
+
+    def update(updates: Any, state: Any, params: Any = None):
+        with dtypes.usual():
+            return optimizer.update(updates, state, params)
+
+    return optax.GradientTransformation(optimizer.init, update)
 
 
 def init_optimizer(optimizer: Optimizer, params: Params) -> PyTree:

@@ -69,7 +69,7 @@ def add(replay: Replay, trajectory: Trajectory, latent: PyTree) -> Replay:
     length = trajectory.reward.shape[1]
     if length > capacity:
         raise ValueError(f"cannot add {length} steps to a buffer of {capacity}")
-    time = (replay.head + jnp.arange(length)) % capacity
+    time = (replay.head + jnp.arange(length, dtype=jnp.int32)) % capacity
 
     def write(buffer, x):
         return buffer.at[:, time].set(x.astype(buffer.dtype))
@@ -95,10 +95,11 @@ def draw(replay: Replay, key: Key, *, batch_size: int, length: int) -> Positions
     """
     num_envs, capacity = replay.trajectory.reward.shape
     key_env, key_start = jax.random.split(key)
-    env = jax.random.randint(key_env, (batch_size,), 0, num_envs)
-    start = jax.random.randint(key_start, (batch_size,), 0, replay.size - length + 1)
+    env = jax.random.randint(key_env, (batch_size,), 0, num_envs, jnp.int32)
+    last = replay.size - length + 1
+    start = jax.random.randint(key_start, (batch_size,), 0, last, jnp.int32)
     oldest = replay.head - replay.size
-    time = (oldest + start[:, None] + jnp.arange(length)[None, :]) % capacity
+    time = (oldest + start[:, None] + jnp.arange(length, dtype=jnp.int32)[None, :]) % capacity
     return Positions(env, time)
 
 

@@ -18,7 +18,7 @@ from vawm.agent import Agent
 from vawm.config import Config
 from vawm.envs.protocol import Environment
 from vawm.learning import replay
-from vawm.learning.collector import Collector, begin, make_collect
+from vawm.learning.collector import Collector, begin, in_float32, make_collect
 from vawm.learning.from_replay import make_learn
 from vawm.learning.replay import Replay
 from vawm.learning.state import Learner, init_learner
@@ -51,8 +51,7 @@ def make_train_step(env: Environment, agent: Agent, config: Config) -> TrainStep
 
     Metrics: the counters `env_steps`, `updates` (so far), `chunk/updates` and `chunk/nonfinite`
     (of what environments return, and of actions); sums over finished episodes, `episode/*` and
-    `env/nonfinite`; and means of the rest over the updates of this chunk (NaN if there were
-    none).
+    `env/nonfinite`; and means of the rest over the updates of this chunk, 0 if there were none.
     """
     collect = make_collect(env, agent, config)
     learn = make_learn(agent, config)
@@ -96,7 +95,7 @@ def init(env: Environment, agent: Agent, config: Config, key: Key) -> TrainState
     """The state before the first step: fresh parameters, environments and replay."""
     key, key_learner, key_env = jax.random.split(key, 3)
     env_state, timestep = env.reset(key_env)
-    collector = begin(agent, timestep, env_state, num_envs=config.num_envs)
+    collector = begin(agent, in_float32(timestep), env_state, num_envs=config.num_envs)
     return TrainState(
         learner=init_learner(agent, config, key_learner),
         collector=collector,

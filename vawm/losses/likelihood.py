@@ -11,6 +11,7 @@ import jax.numpy as jnp
 
 from .transforms import (
     LOWEST,
+    at_least_float32,
     categorical_kl,
     finite_kl,
     symlog,
@@ -81,10 +82,11 @@ def prediction_loss(
     chex.assert_equal_shape([cont_logit, *parts])
     if len(parts) == 0:
         parts = [jnp.zeros_like(cont_logit)]
+    alive = 1.0 - is_terminal.astype(at_least_float32(cont_logit).dtype)
     return PredictionLoss(
         reconstruction=functools.reduce(jnp.add, parts),
         reward=two_hot_cross_entropy(reward_logits, reward, bins),
-        cont=continue_loss(cont_logit, discount * (1.0 - is_terminal)),
+        cont=continue_loss(cont_logit, discount * alive),
     )
 
 
@@ -121,7 +123,8 @@ def symlog_mse(prediction: Array, target: Array) -> Array:
       AssertionError: the shapes differ.
     """
     chex.assert_equal_shape([prediction, target])
-    return jnp.square(prediction.astype(jnp.float32) - symlog(target)).sum(-1)
+    prediction = at_least_float32(prediction)
+    return jnp.square(prediction - symlog(target).astype(prediction.dtype)).sum(-1)
 
 
 def image_mse(prediction: Array, target: Array) -> Array:
@@ -143,8 +146,9 @@ def image_mse(prediction: Array, target: Array) -> Array:
       AssertionError: the shapes differ.
     """
     chex.assert_equal_shape([prediction, target])
-    scaled = target.astype(jnp.float32) / 255.0
-    return jnp.square(prediction.astype(jnp.float32) - scaled).sum((-3, -2, -1))
+    prediction = at_least_float32(prediction)
+    scaled = target.astype(prediction.dtype) / 255.0
+    return jnp.square(prediction - scaled).sum((-3, -2, -1))
 
 
 def continue_loss(logit: Array, target: Array) -> Array:
@@ -167,9 +171,9 @@ def continue_loss(logit: Array, target: Array) -> Array:
       AssertionError: the shapes differ.
     """
     chex.assert_equal_shape([logit, target])
-    logit = logit.astype(jnp.float32)
+    logit = at_least_float32(logit)
     logit = jnp.where(jnp.isinf(logit), jnp.sign(logit) * -LOWEST, logit)
-    return jax.nn.softplus(logit) - target * logit
+    return jax.nn.softplus(logit) - target.astype(logit.dtype) * logit
 
 
 def dynamics_loss(

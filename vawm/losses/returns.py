@@ -89,8 +89,8 @@ def replay_returns(
     """
     chex.assert_rank(reward, 2)
     chex.assert_equal_shape([reward, is_last, is_terminal, bootstrap])
-    mix = lambda_ * (1.0 - is_last)
-    live = discount * (1.0 - is_terminal)
+    mix = lambda_ * (1.0 - is_last.astype(reward.dtype))
+    live = discount * (1.0 - is_terminal.astype(reward.dtype))
     # R_t = base_{t+1} + carry_{t+1} * R_{t+1}
     base = reward + live * (1 - mix) * bootstrap
     carry = live * mix
@@ -119,7 +119,7 @@ def init_return_scale() -> ReturnScale:
       `ReturnScale` with both percentiles 0, each `[]`; without bias correction, as in the
       official DreamerV3.
     """
-    return ReturnScale(low=jnp.zeros(()), high=jnp.zeros(()))
+    return ReturnScale(low=jnp.zeros((), jnp.float32), high=jnp.zeros((), jnp.float32))
 
 
 def update_return_scale(
@@ -139,7 +139,9 @@ def update_return_scale(
     Returns:
       `ReturnScale` of `[]` averages, in environment units. The returns are stopped.
     """
-    now = jnp.quantile(jax.lax.stop_gradient(returns), jnp.array([low, high]))
+    returns = jax.lax.stop_gradient(returns)
+    now = jnp.quantile(returns, jnp.array([low, high], returns.dtype))
+    now = now.astype(state.low.dtype)
     return ReturnScale(
         low=decay * state.low + (1 - decay) * now[0],
         high=decay * state.high + (1 - decay) * now[1],

@@ -1,7 +1,8 @@
 """Symlog, the two-hot code over symexp-spaced bins, and categorical arithmetic.
 
 The bins reach +-4.85e8 and are exactly symmetric, and sums over them are arranged such that
-symmetric terms cancel exactly. Everything is computed in float32, whatever the logits' dtype.
+symmetric terms cancel exactly. Everything is computed in the dtype of the logits, but never in
+less than float32; see `at_least_float32`.
 """
 
 from __future__ import annotations
@@ -18,6 +19,11 @@ Array = jax.Array
 
 LOWEST = -1e30
 """Stands for a logit of -inf inside of sums: its probability is 0 too, but 0 * LOWEST is 0."""
+
+
+def at_least_float32(x: Array) -> Array:
+    """`x` in float64 if it is that already, as under `jax_enable_x64`; else in float32."""
+    return x.astype(jnp.float64 if x.dtype == jnp.float64 else jnp.float32)
 
 
 def symlog(x: Array) -> Array:
@@ -102,12 +108,13 @@ def make_two_hot(n: int, spacing: Literal["symexp", "symlog"]) -> TwoHot:
     if spacing == "symexp":
         bins = symexp_bins(n)
         return TwoHot(bins, lambda y: y, lambda logits: two_hot_mean(logits, bins))
-    bins = jnp.linspace(-20.0, 20.0, n)
+    bins = jnp.linspace(-20.0, 20.0, n, dtype=jnp.float32)
 
     def mean(logits: Array) -> Array:
         # Not a matrix product, which accelerators would round to fewer bits.
-        probs = jax.nn.softmax(logits.astype(jnp.float32))
-        return symexp((probs * jnp.expand_dims(bins, tuple(range(logits.ndim - 1)))).sum(-1))
+        probs = jax.nn.softmax(at_least_float32(logits))
+        values = jnp.expand_dims(bins.astype(probs.dtype), tuple(range(logits.ndim - 1)))
+        return symexp((probs * values).sum(-1))
 
     return TwoHot(bins, symlog, mean)
 
@@ -118,9 +125,10 @@ def two_hot(y: Array, bins: Array) -> Array:
     Weights are linear in raw distance; a `y` beyond the ends is put on the end bin. Losses do
     not build this array: see `two_hot_cross_entropy`.
     """
-    below, above, share = _neighbours(y, bins)
+    below, above, share = _neighbours(at_least_float32(y), bins)
     n, share = bins.shape[0], share[..., None]
-    return (1 - share) * jax.nn.one_hot(below, n) + share * jax.nn.one_hot(above, n)
+    below, above = (jax.nn.one_hot(index, n, dtype=share.dtype) for index in (below, above))
+    return (1 - share) * below + share * above
 
 
 def two_hot_mean(logits: Array, bins: Array) -> Array:
@@ -138,10 +146,10 @@ def two_hot_mean(logits: Array, bins: Array) -> Array:
     """
     chex.assert_equal(logits.shape[-1:], bins.shape)
     half = bins.shape[0] // 2
-    logits = logits.astype(jnp.float32)
+    logits = at_least_float32(logits)
     exp = jnp.exp(logits - jax.lax.stop_gradient(logits.max(-1, keepdims=True)))
     odd = exp[..., -half:] - exp[..., :half][..., ::-1]
-    upper = jnp.expand_dims(bins[-half:], tuple(range(logits.ndim - 1)))
+    upper = jnp.expand_dims(bins[-half:].astype(logits.dtype), tuple(range(logits.ndim - 1)))
     return (odd * upper).sum(-1) / exp.sum(-1)
 
 
@@ -196,7 +204,9 @@ def two_hot_cross_entropies(
     chex.assert_equal_shape([normalizer, *targets])
 
     def score(target):
-        below, above, share = _neighbours(jax.lax.stop_gradient(target), bins)
+        below, above, share = _neighbours(
+            jax.lax.stop_gradient(target).astype(logits.dtype), bins
+        )
         return (1 - share) * _pick(logits, below) + share * _pick(logits, above)
 
     return tuple(normalizer - score(target) for target in targets)
@@ -207,7 +217,7 @@ def unimix_logits(logits: Array, unimix: float) -> Array:
 
     So for u > 0 a class with logit -inf, such as an action that is masked, is possible again.
     """
-    log_prob = jax.nn.log_softmax(logits.astype(jnp.float32))
+    log_prob = jax.nn.log_softmax(at_least_float32(logits))
     if unimix == 0:
         return log_prob
     return jnp.log((1 - unimix) * jnp.exp(log_prob) + unimix / logits.shape[-1])
@@ -226,8 +236,8 @@ def categorical_kl(p_logits: Array, q_logits: Array) -> Array:
       q_logits: `[..., K]`, likewise. At least one class is not excluded.
 
     Returns:
-      `[...]` in nats, in float32; exactly 0 for equal logits. Infinite where q excludes a class
-      that p does not; the gradient has no meaning there. Nothing is stopped.
+      `[...]` in nats; exactly 0 for equal logits. Infinite where q excludes a class that p
+      does not; the gradient has no meaning there. Nothing is stopped.
 
     Raises:
       AssertionError: the shapes differ.
@@ -239,8 +249,8 @@ def categorical_kl(p_logits: Array, q_logits: Array) -> Array:
 
 def finite_kl(p_logits: Array, q_logits: Array) -> Array:
     """`categorical_kl` of logits that are all finite, as those of a head or after unimix."""
-    log_p = jax.nn.log_softmax(p_logits.astype(jnp.float32))
-    log_q = jax.nn.log_softmax(q_logits.astype(jnp.float32))
+    log_p = jax.nn.log_softmax(at_least_float32(p_logits))
+    log_q = jax.nn.log_softmax(at_least_float32(q_logits))
     return (jnp.exp(log_p) * (log_p - log_q)).sum(-1)
 
 
@@ -254,18 +264,19 @@ def categorical_entropy(logits: Array) -> Array:
 
 
 def floored(logits: Array, where: Array | bool = True) -> Array:
-    """The logits in float32, with `LOWEST` for -inf `where` this is true.
+    """The logits, at least in float32, with `LOWEST` for -inf `where` this is true.
 
     Replaced before any sum, so that finite logits keep every bit of a loss and of its gradient.
     """
-    logits = logits.astype(jnp.float32)
+    logits = at_least_float32(logits)
     return jnp.where((logits == -jnp.inf) & where, LOWEST, logits)
 
 
 def _neighbours(y: Array, bins: Array) -> tuple[Array, Array, Array]:
     """Indices of the bins below and above `y`, and the weight of the one above."""
     # Clipping keeps NaN, and the weight becomes NaN: a broken target is not hidden.
-    y = jnp.clip(y.astype(jnp.float32), bins[0], bins[-1])
+    bins = bins.astype(y.dtype)
+    y = jnp.clip(y, bins[0], bins[-1])
     after = jnp.searchsorted(bins, y, side="right")
     last = bins.shape[0] - 1
     below, above = jnp.clip(after - 1, 0, last), jnp.clip(after, 0, last)

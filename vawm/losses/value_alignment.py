@@ -6,7 +6,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from .transforms import categorical_kl, finite_kl
+from .transforms import at_least_float32, categorical_kl, finite_kl
 
 Array = jax.Array
 
@@ -71,5 +71,6 @@ def value_alignment_weight(latent_kl: Array, step: Array, *, warmup_steps: int) 
       AssertionError: `step` is not a scalar.
     """
     chex.assert_rank(step, 0)
-    active = jnp.asarray(step > warmup_steps, jnp.float32)
-    return active / jnp.maximum(1.0, jax.lax.stop_gradient(latent_kl))
+    latent_kl = at_least_float32(jax.lax.stop_gradient(latent_kl))
+    active = jnp.asarray(step > warmup_steps, latent_kl.dtype)
+    return active / jnp.maximum(1.0, latent_kl)

@@ -10,7 +10,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from .transforms import floored
+from .transforms import at_least_float32, floored
 
 Array = jax.Array
 
@@ -123,9 +123,9 @@ def categorical_iter_vaml_loss(prediction_logits: Array, target_logits: Array) -
       AssertionError: the shapes differ.
     """
     chex.assert_equal_shape([prediction_logits, target_logits])
-    target = jax.nn.softmax(jax.lax.stop_gradient(target_logits).astype(jnp.float32))
-    prediction = floored(prediction_logits, where=target == 0)
-    return -(target * jax.nn.log_softmax(prediction)).sum(-1)
+    target = jax.nn.softmax(at_least_float32(jax.lax.stop_gradient(target_logits)))
+    log_prob = jax.nn.log_softmax(floored(prediction_logits, where=target == 0))
+    return -(target.astype(log_prob.dtype) * log_prob).sum(-1)
 
 
 def _deviations(prediction_values: Array, target_value: Array) -> Array:

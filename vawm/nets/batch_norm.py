@@ -88,8 +88,8 @@ class BatchNorm(nn.Module):
 
     def setup(self):
         shape = (self.features,)
-        self.scale = self.param("scale", nn.initializers.ones, shape)
-        self.bias = self.param("bias", nn.initializers.zeros, shape)
+        self.scale = self.param("scale", nn.initializers.ones, shape, jnp.float32)
+        self.bias = self.param("bias", nn.initializers.zeros, shape, jnp.float32)
         self.mean = self.variable("statistics", "mean", jnp.zeros, shape, jnp.float32)
         self.var = self.variable("statistics", "var", jnp.ones, shape, jnp.float32)
 

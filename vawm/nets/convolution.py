@@ -172,7 +172,7 @@ class Kernel(nn.Module):
         shape = (TAPS, TAPS, self.inputs, self.outputs)
         init = truncated_normal_in(TAPS * TAPS * self.inputs, 1.0)
         kernel = self.param("kernel", init, shape)
-        bias = self.param("bias", nn.initializers.zeros, (self.outputs,))
+        bias = self.param("bias", nn.initializers.zeros, (self.outputs,), jnp.float32)
         return kernel.astype(self.dtype), bias.astype(self.dtype)
 
 
@@ -186,7 +186,7 @@ class Halve(nn.Module):
     @nn.compact
     def __call__(self, x: Array) -> Array:
         kernel, bias = Kernel(self.inputs, self.outputs, self.dtype, name="conv")()
-        norm = self.param("norm", nn.initializers.ones, (self.outputs,))
+        norm = self.param("norm", nn.initializers.ones, (self.outputs,), jnp.float32)
         x = convolve(to_blocks(x), pooled_kernel(kernel)).max(-2)
         return nn.silu(rms_norm(x + bias.reshape(1, 1, 1, -1), norm))
 
@@ -201,7 +201,7 @@ class Double(nn.Module):
     @nn.compact
     def __call__(self, x: Array) -> Array:
         kernel, bias = Kernel(self.inputs, self.outputs, self.dtype, name="conv")()
-        norm = self.param("norm", nn.initializers.ones, (self.outputs,))
+        norm = self.param("norm", nn.initializers.ones, (self.outputs,), jnp.float32)
         x = convolve(x, repeated_kernel(kernel)) + bias.reshape(1, 1, 1, 1, -1)
         return from_phases(nn.silu(rms_norm(x, norm)))
 
@@ -248,7 +248,9 @@ class ImageDecoder(nn.Module):
         init = truncated_normal_in(self.deter, 1.0)
         shape = (self.blocks, self.deter // self.blocks, side * side * top // self.blocks)
         kernel = self.param("deter_kernel", init, shape)
-        bias = self.param("deter_bias", nn.initializers.zeros, (side * side * top,))
+        bias = self.param(
+            "deter_bias", nn.initializers.zeros, (side * side * top,), jnp.float32
+        )
         blocks = deter.reshape(-1, self.blocks, shape[1]).swapaxes(0, 1)
         x = block_product(blocks, kernel, self.dtype)  # [blocks, N, side * side * group]
         x = x + bias.astype(self.dtype).reshape(self.blocks, 1, -1)
@@ -256,7 +258,7 @@ class ImageDecoder(nn.Module):
         x = x.transpose(1, 2, 3, 0, 4).reshape(-1, side, side, top)
         z = Layer(self.stoch, 2 * self.units, self.dtype, name="stoch_layer")(stoch)
         z = Linear(2 * self.units, side * side * top, dtype=self.dtype, name="stoch_out")(z)
-        norm = self.param("norm", nn.initializers.ones, (top,))
+        norm = self.param("norm", nn.initializers.ones, (top,), jnp.float32)
         x = nn.silu(rms_norm(x + z.reshape(x.shape), norm))
         inputs = top
         for i, width in enumerate(STAGE_WIDTHS[-2::-1]):

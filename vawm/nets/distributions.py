@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Callable
 from typing import NamedTuple
@@ -10,8 +11,14 @@ import chex
 import jax
 import jax.numpy as jnp
 
+from vawm.errors import InvalidInput
 from vawm.losses.transforms import unimix_logits
 
+if sys.flags.optimize > 1:
+    remedy = (
+        "TensorFlow Probability, which distrax imports, needs docstrings; use 1, or unset it"
+    )
+    raise InvalidInput("PYTHONOPTIMIZE", sys.flags.optimize, remedy)
 with warnings.catch_warnings():
     warnings.filterwarnings("ignore", category=DeprecationWarning)
     import distrax
@@ -74,7 +81,7 @@ def sample_one_hot(logits: Array, uniform: Array, *, unimix: float) -> Array:
       `[..., K]` float32, exactly 0 and 1. The logits receive the gradient of p.
     """
     probs = probabilities(logits, unimix=unimix)
-    one_hot = jax.nn.one_hot(_invert(probs, uniform), logits.shape[-1])
+    one_hot = jax.nn.one_hot(_invert(probs, uniform), logits.shape[-1], dtype=probs.dtype)
     # p - sg(p) is exactly 0. Computed first, it adds no rounding error to the sample.
     return one_hot + (probs - jax.lax.stop_gradient(probs))
 

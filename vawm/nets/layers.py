@@ -51,7 +51,7 @@ class Linear(nn.Module):
     def setup(self):
         init = truncated_normal_in(self.in_features, self.scale)
         self.kernel = self.param("kernel", init, (self.in_features, self.out_features))
-        self.bias = self.param("bias", nn.initializers.zeros, (self.out_features,))
+        self.bias = self.param("bias", nn.initializers.zeros, (self.out_features,), jnp.float32)
 
     def rows(self, x: Array, start: int) -> Array:
         """x @ W[start : start + width(x)], without bias."""
@@ -79,7 +79,7 @@ class Layer(nn.Module):
 
     def setup(self):
         self.linear = Linear(self.in_features, self.units, dtype=self.dtype)
-        self.norm = self.param("norm", nn.initializers.ones, (self.units,))
+        self.norm = self.param("norm", nn.initializers.ones, (self.units,), jnp.float32)
 
     def activate(self, y: Array) -> Array:
         return nn.silu(rms_norm(y, self.norm))

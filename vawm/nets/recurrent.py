@@ -44,12 +44,12 @@ class BlockGRU(nn.Module):
             truncated_normal_in(fan_in, 1.0),
             (self.blocks, width + shared, width),
         )
-        self.mix_bias = self.param("mix_bias", zeros, (self.deter,))
-        self.mix_norm = self.param("mix_norm", ones, (self.deter,))
+        self.mix_bias = self.param("mix_bias", zeros, (self.deter,), jnp.float32)
+        self.mix_norm = self.param("mix_norm", ones, (self.deter,), jnp.float32)
         self.gate_kernel = self.param(
             "gate_kernel", truncated_normal_in(self.deter, 1.0), (self.blocks, width, 3 * width)
         )
-        self.gate_bias = self.param("gate_bias", zeros, (3 * self.deter,))
+        self.gate_bias = self.param("gate_bias", zeros, (3 * self.deter,), jnp.float32)
 
     def to_blocks(self, deter: Array) -> Array:
         """`[N, D]` -> `[blocks, N, D / blocks]`."""

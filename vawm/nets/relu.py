@@ -36,8 +36,8 @@ class LayerNorm(nn.Module):
 
     @nn.compact
     def __call__(self, x: Array) -> Array:
-        scale = self.param("scale", nn.initializers.ones, (self.width,))
-        bias = self.param("bias", nn.initializers.zeros, (self.width,))
+        scale = self.param("scale", nn.initializers.ones, (self.width,), jnp.float32)
+        bias = self.param("bias", nn.initializers.zeros, (self.width,), jnp.float32)
         leading = (1,) * (x.ndim - 1)
         y = x.astype(jnp.float32)
         y = y - y.mean(-1, keepdims=True)

@@ -273,7 +273,7 @@ def scan_images(step: Callable, start: Any, *images: Array) -> tuple[Any, Array]
 
 def map_images(function: Callable[[Array], Array], images: Array) -> Array:
     """Applies `function` to all images, a few at a time."""
-    nothing = jnp.zeros(())
+    nothing = jnp.zeros((), jnp.float32)
     return scan_images(lambda nothing, few: (nothing, function(few)), nothing, images)[1]
 
 

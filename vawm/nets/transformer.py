@@ -12,13 +12,14 @@ results.)
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
 from vawm.nets.relu import LayerNorm, UniformLinear
+from vawm.process import dtypes
 from vawm.types import Array
 
 BLOCK_EPSILON = 1e-6  # of the norms in this module; others use `relu.NORM_EPSILON`
@@ -74,7 +75,7 @@ def attend_at_once(
     """`attend_cached` with matrix products; `[N, heads, d]` float32."""
     f32 = jnp.float32
     scores = jnp.einsum("nhd,snhd->nhs", query, keys, preferred_element_type=f32)
-    used = jnp.arange(keys.shape[0]) < length
+    used = jnp.arange(keys.shape[0], dtype=jnp.int32) < length
     shown = (visible & used[:, None]).T
     scores = jnp.where(shown[:, None], scores / math.sqrt(query.shape[-1]), HIDDEN)
     mixed = jnp.einsum("nhs,snhd->nhd", jax.nn.softmax(scores).astype(values.dtype), values)
@@ -97,10 +98,18 @@ def attend_slot_by_slot(
         mixed = mixed * keep[..., None] + weight[..., None] * value
         return largest, weights * keep + weight, mixed
 
-    nothing = jnp.zeros(query.shape[:-1])
+    nothing = jnp.zeros(query.shape[:-1], jnp.float32)
     start = (jnp.full_like(nothing, HIDDEN), nothing, jnp.zeros_like(query))
     _, weights, mixed = jax.lax.fori_loop(0, length, add, start)
     return mixed / weights[..., None]
+
+
+class Dropout(nn.Dropout):
+    """Flax's dropout; its mask does not depend on `jax_enable_x64`, which would draw others."""
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Array:
+        with dtypes.usual():
+            return super().__call__(*args, **kwargs)
 
 
 class Block(nn.Module):
@@ -120,7 +129,7 @@ class Block(nn.Module):
         self.wide = linear(self.width, self.feedforward, True, self.dtype)
         self.narrow = linear(self.feedforward, self.width, True, self.dtype)
         self.feedforward_norm = LayerNorm(self.width, BLOCK_EPSILON)
-        self.drop = nn.Dropout(self.dropout)
+        self.drop = Dropout(self.dropout)
 
     def project(self, x: Array) -> list[Array]:
         """Queries, keys and values, each `[..., heads, D / heads]`."""
@@ -164,7 +173,7 @@ class Transformer(nn.Module):
 
     def setup(self):
         self.position = self.param(
-            "position", nn.initializers.normal(1.0), (self.positions, self.width)
+            "position", nn.initializers.normal(1.0), (self.positions, self.width), jnp.float32
         )
         self.norm = LayerNorm(self.width, BLOCK_EPSILON)
         sizes = self.width, self.heads, self.feedforward, self.dropout, self.dtype

@@ -90,7 +90,7 @@ def on_device(env: Environment, policy: Policy, key: Array, how: How = "sample")
             carry=carry,
             key=key,
             done=loop.done | timestep.is_last,
-            total=loop.total + jnp.where(loop.done, 0.0, timestep.reward),
+            total=loop.total + jnp.where(loop.done, 0.0, timestep.reward).astype(jnp.float32),
         )
 
     env_state, timestep = env.reset(key_reset)
@@ -100,7 +100,7 @@ def on_device(env: Environment, policy: Policy, key: Array, how: How = "sample")
         carry=policy.initial(num_envs),
         key=key_act,
         done=jnp.zeros(num_envs, bool),
-        total=jnp.zeros(num_envs),
+        total=jnp.zeros(num_envs, jnp.float32),
     )
     return jax.lax.while_loop(lambda loop: ~loop.done.all(), one_step, first).total
 

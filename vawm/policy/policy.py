@@ -14,7 +14,7 @@ from vawm.agent import PolicyCarry, make_agent
 from vawm.config import Config
 from vawm.policy import weights
 from vawm.policy.weights import Description
-from vawm.runs import budget, checkpoint, validate
+from vawm.runs import budget, checkpoint, settings, validate
 from vawm.runs.checkpoint import manifest
 from vawm.runs.checkpoint.manifest import Manifest
 from vawm.types import Array, EnvSpec, Key, Params, PyTree, TimeStep
@@ -62,10 +62,11 @@ def load(logdir: str | os.PathLike[str]) -> Policy:
     log `vawm` if a newer one is damaged.
 
     Raises:
-      InvalidInput: there is no checkpoint, or all are damaged.
+      InvalidInput: there is no checkpoint, or all are damaged; or JAX has no device.
     """
     if weights.found(logdir):
         return import_policy(logdir)
+    settings.check()
     found = checkpoint.usable(logdir, checkpoint.ACTING)
     validate.check_spec(found.manifest.config, found.manifest.spec)
     return _policy(found.manifest, functools.partial(checkpoint.read_agent, found))
@@ -77,6 +78,7 @@ def import_policy(folder: str | os.PathLike[str]) -> Policy:
     Raises:
       InvalidInput: a file is missing or damaged, or the weights do not fit the config.
     """
+    settings.check()
     description = weights.describe(folder)
     return _policy(description, functools.partial(weights.read, folder, description))
 

@@ -10,13 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from vawm.config import CUSTOM, Config
+from vawm.envs import made as records
 from vawm.errors import InvalidInput
 from vawm.learning.replay import Replay
-from vawm.runs import checkpoint, run_folder, validate
+from vawm.runs import checkpoint, run_folder, settings, validate
 from vawm.runs.checkpoint import manifest
 from vawm.runs.checkpoint.manifest import Manifest, OtherVersion
 from vawm.runs.reports import tracking
-from vawm.types import PyTree
+from vawm.types import EnvSpec, Made, PyTree
 
 MAY_DIFFER = (
     "env_steps",
@@ -50,19 +51,58 @@ def saved_config(logdir: str | os.PathLike[str]) -> Config:
     return checkpoint.find(logdir, ()).manifest.config
 
 
+def saved_spec(logdir: str | os.PathLike[str]) -> EnvSpec | None:
+    """The environments of the run in `logdir`; None before its first checkpoint."""
+    if checkpoint.latest(logdir) is None:
+        return None
+    return checkpoint.find(logdir, ()).manifest.spec
+
+
+def saved_made(logdir: str | os.PathLike[str]) -> Made | None:
+    """How the environments of the run in `logdir` were made; None in an earlier version's."""
+    spec = saved_spec(logdir)
+    if spec is None:
+        return run_folder.read_made(checkpoint.expanded(logdir))
+    return spec.made
+
+
+def check_environments(logdir: str | os.PathLike[str], spec: EnvSpec) -> list[str]:
+    """Refuses to resume the run in `logdir` in environments of `spec` if they are others.
+
+    Returns:
+      Warnings about what may differ between equal environments.
+
+    Raises:
+      InvalidInput: the observations, the actions, their number, or how they were made.
+    """
+    then = saved_spec(logdir) or spec._replace(made=saved_made(logdir))
+    warnings = []
+    for name, saved, now, grave in records.differences(then, spec):
+        if grave:
+            remedy = f"the run was started with {saved!r}; resume it in the same environments"
+            raise InvalidInput(f"env.{name}", now, remedy)
+        warnings.append(
+            f"the environments' {name} was {saved!r} when the run started, now {now!r}"
+        )
+    return warnings
+
+
 def check(logdir: str | os.PathLike[str], config: Config) -> None:
     """Refuses to resume the run in `logdir` with `config` if that cannot work.
 
     Raises:
       InvalidInput: there is no run, its checkpoints are missing, another version wrote
-        them, a choice differs, or the run is already complete.
+        them, a choice or the generator of random numbers differs, or the run is complete.
     """
     started = saved_config(logdir)
     path = checkpoint.latest(logdir)
     if path is None:
         _refuse_to_lose(logdir, started)
     else:
-        _refuse_another_version(checkpoint.find(logdir, ()))
+        found = checkpoint.find(logdir, ())
+        _refuse_another_version(found)
+        infos = found.manifest.leaves.get("state", {}).values()
+        settings.check_keys({info.impl for info in infos if info.impl})
     saved = dict(validate.values(started))
     choices = list(validate.values(config))
     if config.size == CUSTOM:  # check size last, to name the width that differs instead

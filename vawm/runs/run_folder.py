@@ -14,9 +14,11 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from vawm.config import Config, as_dict
+from vawm.envs import made as records
 from vawm.errors import InvalidInput
 from vawm.process import names
 from vawm.runs.checkpoint import manifest
+from vawm.types import Made
 
 HELD = (errno.EAGAIN, errno.EACCES)
 NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.EINVAL)
@@ -131,8 +133,10 @@ def claim(logdir: pathlib.Path, *, say: Callable[[str], None] = print) -> Iterat
         yield
 
 
-def write_config(logdir: pathlib.Path, config: Config) -> None:
+def write_config(logdir: pathlib.Path, config: Config, made: Made | None = None) -> None:
     """Writes `config.json`: all choices of the run and the version that wrote them.
+
+    `made` says how the environments were made.
 
     Raises:
       OSError: it could not be written; the folder is unchanged.
@@ -141,6 +145,7 @@ def write_config(logdir: pathlib.Path, config: Config) -> None:
         "schema": manifest.SCHEMA,
         "vawm": manifest.version(),
         "config": as_dict(config),
+        "environments": None if made is None else records.as_dict(made),
     }
     scratch = logdir / (CONFIG + ".tmp")
     try:
@@ -166,6 +171,20 @@ def read_config(logdir: pathlib.Path) -> Config | None:
     except InvalidInput as error:
         written = content["vawm"]
         raise manifest.OtherVersion("logdir", path, error, written=written) from error
+
+
+def read_made(logdir: pathlib.Path) -> Made | None:
+    """How the environments of the run in `logdir` were made; None if it does not say.
+
+    Raises:
+      InvalidInput: the record is damaged.
+    """
+    path = logdir / CONFIG
+    content = (_content(path) or {}).get("environments")
+    try:
+        return None if content is None else records.from_dict(content)
+    except ValueError as error:
+        raise InvalidInput("logdir", str(path), f"is damaged: {error}") from error
 
 
 def _content(path: pathlib.Path) -> dict[str, Any] | None:

@@ -11,6 +11,7 @@ import contextlib
 import errno
 import functools
 import pathlib
+import signal
 import sys
 import time
 from collections.abc import Callable, Mapping
@@ -21,16 +22,17 @@ import rich.console
 
 from vawm.agent import registry
 from vawm.config import Config
+from vawm.envs import made
 from vawm.envs.protocol import Environment, EnvironmentFailure, HostEnvironment
 from vawm.errors import InvalidInput
 from vawm.process import names, signals, streams
-from vawm.runs import budget, checkpoint, diagnosis, run_folder, suites, validate
+from vawm.runs import budget, checkpoint, diagnosis, run_folder, settings, suites, validate
 from vawm.runs.checkpoint import manifest
 from vawm.runs.reports import backends, tracking, video
 from vawm.runs.reports.display import Display
 from vawm.runs.reports.tracking import Interval, Line
 from vawm.runs.resume import check as check_resume
-from vawm.runs.resume import cut_back, restore
+from vawm.runs.resume import check_environments, cut_back, restore, saved_made, saved_spec
 from vawm.runs.trainer import Kept, Trainer, everything
 from vawm.runs.trainer import make as make_trainer
 from vawm.types import PyTree
@@ -64,12 +66,20 @@ class Result(NamedTuple):
     Attributes:
       logdir: the folder of the run.
       env_steps: control steps done.
-      exit_code: 0, or the shell's exit code for the signal that stopped the run.
+      exit_code: 0, or the shell's exit code for the signal that asked the run to stop.
     """
 
     logdir: pathlib.Path
     env_steps: int
     exit_code: int
+
+    @property
+    def stopped_by(self) -> signal.Signals | None:
+        """The signal that asked the run to stop, such as SIGTERM; None without one.
+
+        A script that trains several runs has to end then: `if result.stopped_by: break`.
+        """
+        return signal.Signals(self.exit_code - 128) if self.exit_code else None
 
 
 @streams.outlive()
@@ -92,8 +102,8 @@ def run(
       resume: continue from the newest undamaged checkpoint in `logdir`, or from the start if
         the run stopped before its first one. Renames newer checkpoints, which are damaged.
       fresh: start over in `logdir`; moves its content to a folder `replaced-<number>`.
-      env: replaces the environment that `config.task` names; a host environment is closed
-        at the end.
+      env: replaces the environment that `config.task` names, or that the resumed run was
+        trained in; a host environment is closed at the end.
       console: prints progress; standard output by default.
       banner: printed when the run starts, after all checks.
       command: the caller's command line, for the advice at the end.
@@ -111,14 +121,20 @@ def run(
         stack.enter_context(_explained(logdir))
         if not isinstance(env, Environment | None):
             stack.enter_context(contextlib.closing(env))
-        check(config, logdir, resume=resume, fresh=fresh, known_task=env is None)
+        by_command = env is None
+        check(config, logdir, resume=resume, fresh=fresh, known_task=by_command)
+        if env is None and resume:
+            env = _made_again(config, logdir)
         trainer = stack.enter_context(contextlib.closing(prepare(config, env)))
+        if resume:
+            for warning in check_environments(logdir, trainer.spec):
+                say(f"WARNING: {warning}")
         stack.enter_context(run_folder.claim(logdir, say=say))
         if banner:
             say(banner)
         if resume and checkpoint.latest(logdir):
             state, progress = _continue(logdir, trainer, say)
-            run_folder.write_config(logdir, config)
+            run_folder.write_config(logdir, config, trainer.spec.made)
         else:
             if fresh and (aside := run_folder.put_aside(logdir)):
                 old, new = names.shown(logdir), names.shown(aside)
@@ -126,12 +142,37 @@ def run(
             if resume:
                 run_folder.clear(logdir)
                 say(f"no checkpoint in {names.shown(logdir)} yet; starting from the beginning")
-            run_folder.write_config(logdir, config)
+            run_folder.write_config(logdir, config, trainer.spec.made)
             state, progress = trainer.init(config.seed), Progress()
             _refuse_nonfinite(state)
         result = _loop(config, logdir, trainer, state, progress, console)
-    _summarise(config, result, say, command, known_task=env is None)
+    known = trainer.spec.made is not None and made.can_be_made_again(trainer.spec.made)
+    _summarise(config, result, say, command, by_command=by_command, again=by_command or known)
     return result
+
+
+def _made_again(config: Config, logdir: pathlib.Path) -> Environment | HostEnvironment:
+    """The environments of the run in `logdir`, as its record says."""
+    spec = saved_spec(logdir)
+    task = config.task if spec is None else spec.task
+    return suites.make_again(config, saved_made(logdir), task=task, python=_in_python(logdir))
+
+
+def _check_made_again(config: Config, logdir: pathlib.Path) -> None:
+    """Refuses a run whose environments only its caller can make."""
+    record = saved_made(logdir)
+    suites.check_made(record, python=_in_python(logdir))
+    if record is None:
+        suites.check_task(config)
+
+
+def _in_python(logdir: pathlib.Path) -> str:
+    """The statements that resume the run in `logdir` in environments of the caller's."""
+    folder = repr(str(logdir))
+    return (
+        f"config = vawm.runs.resume.saved_config({folder}); "
+        f"vawm.runs.runner.run(config, {folder}, resume=True, env=...)"
+    )
 
 
 def _refuse_nonfinite(state: PyTree) -> None:
@@ -148,14 +189,15 @@ def check(
     fresh: bool = False,
     known_task: bool = True,
 ) -> None:
-    """Refuses a run that cannot work; takes milliseconds and writes nothing.
+    """Refuses a run that cannot work; compiles nothing and writes nothing.
 
     Raises:
       InvalidInput: names field, value and remedy.
     """
+    settings.check_training()
     validate.check(config)
     logdir = checkpoint.expanded(logdir)
-    if known_task:
+    if known_task and not resume:
         suites.check_task(config)
     if not resume:  # a resumed run continues even without its tracker
         backends.check(config)
@@ -165,6 +207,8 @@ def check(
         )
     if resume:
         check_resume(logdir, config)
+        if known_task:
+            _check_made_again(config, logdir)
         for folder in (logdir, checkpoint.root(logdir)):
             run_folder.check_writable(folder)
     elif fresh:
@@ -416,8 +460,19 @@ def _summarise(
     say: Callable[[str], None],
     command: str,
     *,
-    known_task: bool,
+    by_command: bool,
+    again: bool,
 ) -> None:
+    """Says what came out and how to go on.
+
+    Args:
+      config: of the run.
+      result: of the run.
+      say: prints a line.
+      command: that trained it, if it is `by_command` and not a script of the caller's.
+      by_command: whether the run made its environments itself.
+      again: whether commands can make the environments again.
+    """
     lines = tracking.read(result.logdir / "metrics.jsonl")
     returns = [e["episode/return"] for e in lines if e.get("episode/return") is not None]
     shown = f"last {returns[-1]:.1f}, best {max(returns):.1f}" if returns else "none finished"
@@ -437,9 +492,10 @@ def _summarise(
             "" if pathlib.Path(sys.argv[0]).name == pathlib.Path(plugin).name else words
         )
     longer = f" --env-steps {2 * config.env_steps}"
-    if not known_task:  # there is no command line for the user's environment
-        folder = repr(str(result.logdir))
+    folder = repr(str(result.logdir))
+    if not again:  # there is no command line for the user's environment
         evaluation = f"vawm.evaluate.evaluate(vawm.load({folder}), episodes=..., env=...)"
+    if not by_command:
         resumption = f"vawm.runs.runner.run(config, {folder}, env=..., resume=True)"
         longer = ", with larger config.env_steps"
     if finished:

@@ -12,6 +12,7 @@ import numpy as np
 
 from vawm.agent import Agent, make_agent
 from vawm.config import Config
+from vawm.envs import made
 from vawm.envs.host.pool import Episodes
 from vawm.envs.protocol import Environment, HostEnvironment
 from vawm.errors import InvalidInput
@@ -81,9 +82,10 @@ def make(
       InvalidInput: the environments cannot be made, or do not fit the config.
     """
     env = env or suites.make(config)
+    spec = env.spec._replace(made=made.of(env))
     try:
         validate.check_spec(config, env.spec)
-        agent = make_agent(config, env.spec)
+        agent = make_agent(config, spec)
         if isinstance(env, Environment):
             return on_device(env, agent, config, kept)
         return on_host(env, agent, config, kept)
@@ -111,7 +113,7 @@ def on_device(
         return CompiledStep(compiled, (compiled,))
 
     return Trainer(
-        spec=env.spec,
+        spec=agent.spec,
         agent=agent,
         shapes=init.eval_shape(jax.random.key(0)),
         init=lambda seed: init(jax.random.key(seed)),
@@ -126,7 +128,7 @@ def on_host(
     env: HostEnvironment, agent: Agent, config: Config, kept: Kept = everything
 ) -> Trainer:
     """The same update, with environments on the host."""
-    spec, seed = env.spec, config.seed
+    spec, seed = agent.spec, config.seed
     begin = jax.jit(functools.partial(host_train.init, agent, config))
     shapes = begin.eval_shape(jax.random.key(0), host_train.first_timestep(spec))
     images: Callable[[], PyTree] = tuple

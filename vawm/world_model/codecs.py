@@ -145,10 +145,10 @@ def vector_codec(
     """
 
     def init_encoder(key: Key) -> tuple[PyTree, PyTree]:
-        return encoder.init(key, jnp.zeros((1, sum(widths))))["params"], ()
+        return encoder.init(key, jnp.zeros((1, sum(widths)), jnp.float32))["params"], ()
 
     def init_decoder(key: Key) -> tuple[PyTree, PyTree]:
-        inputs = [jnp.zeros((1, width)) for width in latent]
+        inputs = [jnp.zeros((1, width), jnp.float32) for width in latent]
         return decoder.init(key, *inputs)["params"], ()
 
     def encode(params: PyTree, model_state: PyTree, obs: list[Array], *, train: bool):

@@ -80,7 +80,7 @@ def join_heads(codec: Codecs, reward: Network, cont: Network) -> Heads:
 
 def init_network(network: Network, key: Key) -> PyTree:
     """Fresh parameters."""
-    return network.init(key, jnp.zeros((1, network.in_features)))["params"]
+    return network.init(key, jnp.zeros((1, network.in_features), jnp.float32))["params"]
 
 
 def make_heads(config: HeadsConfig, spec: EnvSpec, dtype: jnp.dtype) -> Heads:

@@ -92,7 +92,7 @@ def rssm(
         keep = 1.0 - is_first.astype(dtype)[..., None]
         drive = apply(params, lambda m, a: m.gru.drive(a), prev_action.astype(dtype) * keep)
         tokens = apply(params, nets.RSSM.read_tokens, tokens)
-        uniform = jax.random.uniform(key_post, (*is_first.shape, config.stoch))
+        uniform = jax.random.uniform(key_post, (*is_first.shape, config.stoch), jnp.float32)
 
         def step(latent: Latent, inputs):
             keep, drive, tokens, uniform = inputs
@@ -106,7 +106,7 @@ def rssm(
         _, (latent, post_logits) = jax.lax.scan(step, latent, inputs)
         prior_logits = apply(params, nets.RSSM.prior, latent.deter)
         if noise == "independent":
-            uniform = jax.random.uniform(key_prior, uniform.shape)
+            uniform = jax.random.uniform(key_prior, uniform.shape, jnp.float32)
         prior_latent = Latent(latent.deter, sample(prior_logits, uniform))
         return Inference(latent, prior_latent, post_logits, prior_logits)
 
@@ -121,7 +121,7 @@ def rssm(
         blocks, deter, logits = apply(
             params, nets.RSSM.imagine, blocks, latent.deter, flat_stoch(latent.stoch), drive
         )
-        uniform = jax.random.uniform(key, logits.shape[:-1])
+        uniform = jax.random.uniform(key, logits.shape[:-1], jnp.float32)
         latent = Latent(deter, sample(logits, uniform))
         return (blocks, latent), latent
 

@@ -86,7 +86,7 @@ def storm(
     def init(key: Key) -> tuple[PyTree, PyTree]:
         key_net, key_heads = jax.random.split(key)
         widths = heads.token_size, spec.action_size
-        params = net.init(key_net, *(jnp.zeros((1, 1, width)) for width in widths))
+        params = net.init(key_net, *(jnp.zeros((1, 1, width), jnp.float32) for width in widths))
         head_params, model_state = heads.init(key_heads)
         return {"storm": params["params"], **head_params}, model_state
 
@@ -110,7 +110,7 @@ def storm(
         """For each observation alone: logits, z and its random numbers; the new model_state."""
         tokens, model_state = heads.encode(params, model_state, obs, train=train)
         logits = apply(params, nets.Storm.posterior, tokens)
-        uniform = jax.random.uniform(key, logits.shape[:-1])
+        uniform = jax.random.uniform(key, logits.shape[:-1], jnp.float32)
         return logits, sample(logits, uniform), uniform, model_state
 
     def explain(
@@ -136,7 +136,7 @@ def storm(
         prior_logits = apply(params, nets.Storm.prior, deter)
         uniform = uniform[:, 1:]
         if noise == "independent":
-            uniform = jax.random.uniform(key_prior, uniform.shape)
+            uniform = jax.random.uniform(key_prior, uniform.shape, jnp.float32)
         inference = Inference(
             latent=Latent(deter[:, :-1], stoch[:, 1:]),
             prior_latent=Latent(deter[:, :-1], sample(prior_logits[:, :-1], uniform)),
@@ -157,7 +157,9 @@ def storm(
     def expect(params: PyTree, key: Key, deter: Array) -> Latent:
         """The latent with a sample of the prior at h, `[N, D]`."""
         logits = apply(params, nets.Storm.prior, deter)
-        return Latent(deter, sample(logits, jax.random.uniform(key, logits.shape[:-1])))
+        return Latent(
+            deter, sample(logits, jax.random.uniform(key, logits.shape[:-1], jnp.float32))
+        )
 
     def follow(
         params: PyTree, model_state: PyTree, key: Key, batch: Batch, *, horizon: int

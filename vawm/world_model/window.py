@@ -31,7 +31,7 @@ def empty_window(spec: EnvSpec, context: int, batch_size: int) -> Window:
 
     return Window(
         obs=room((batch_size, context)),
-        action=jnp.zeros((batch_size, context, spec.action_size)),
+        action=jnp.zeros((batch_size, context, spec.action_size), jnp.float32),
         length=jnp.zeros(batch_size, jnp.int32),
         latest=room((batch_size,)),
         waits=jnp.zeros(batch_size, bool),
@@ -49,7 +49,7 @@ def remember(window: Window, action: Array) -> Window:
 
         moved = jnp.where(per_row(full), jnp.roll(past, -1, axis=1), past)
         place = jnp.where(full, context - 1, window.length)
-        here = jnp.arange(context)[None] == place[:, None]
+        here = jnp.arange(context, dtype=jnp.int32)[None] == place[:, None]
         here = (here & window.waits[:, None]).reshape(*here.shape, *(1,) * (past.ndim - 2))
         appended = jnp.where(here, new[:, None], moved)
         return jnp.where(per_row(window.waits), appended, past)

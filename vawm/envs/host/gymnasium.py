@@ -22,6 +22,7 @@ from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec as RegisteredEnv
 from gymnasium.wrappers import TimeLimit
 
+from vawm.envs import made
 from vawm.envs.host.gymnasium_check import pixels, problems, refuse, space_problems
 from vawm.envs.host.pool import Pool
 from vawm.envs.host.simulator import Outcome, Simulator
@@ -129,7 +130,7 @@ def from_gymnasium(
     source = check_id(make) if isinstance(make, str) else make
     task = task or name_of(make)
     make_env = functools.partial(make_environment, source, task, time_limit, kwargs)
-    return Pool(
+    pool = Pool(
         functools.partial(simulate, make_env),
         task=task,
         num_envs=num_envs,
@@ -138,6 +139,17 @@ def from_gymnasium(
         on_failure=on_failure,
         first=functools.partial(check_and_simulate, make_env, task) if check else None,
     )
+    pool.made = made.by_gymnasium(
+        make, options={"time_limit": time_limit}, kwargs=kwargs, wrappers=wrappers_of(source)
+    )
+    return pool
+
+
+def wrappers_of(source: RegisteredEnv | Callable[..., Any]) -> tuple[str, ...]:
+    """Names of the wrappers that an id is registered with."""
+    if not isinstance(source, RegisteredEnv):
+        return ()
+    return tuple(wrapper.name for wrapper in source.additional_wrappers)
 
 
 def check_id(name: str) -> RegisteredEnv:

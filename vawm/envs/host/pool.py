@@ -23,7 +23,7 @@ from vawm.envs.host.simulator import Simulator
 from vawm.envs.host.worker import Trouble, array_fields, leaves
 from vawm.envs.protocol import EnvironmentFailure, check_positive
 from vawm.errors import InvalidInput
-from vawm.types import EnvSpec, TimeStep
+from vawm.types import EnvSpec, Made, TimeStep
 
 __all__ = ["EnvironmentFailure", "Episodes", "Pool", "episode_seed"]
 
@@ -49,7 +49,10 @@ class Pool:
     Attributes:
       spec: what an agent has to know; mostly from the simulators.
       restarts: number of restarts after a failure so far.
+      made: how the environments were made, if whoever makes the pool says so.
     """
+
+    made: Made | None = None
 
     def __init__(
         self,

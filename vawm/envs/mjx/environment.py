@@ -15,6 +15,7 @@ from vawm.envs.mjx import physics
 from vawm.envs.mjx.physics import Physics
 from vawm.envs.mjx.task import Task
 from vawm.envs.protocol import Environment, EnvState
+from vawm.process import dtypes
 from vawm.types import Array, ArraySpec, EnvSpec, Key, TimeStep
 
 EPISODE_STEPS = 1000
@@ -64,6 +65,7 @@ def batch(
         # The data is always finite, unless the caller edited the state.
         return jnp.where(jnp.isfinite(obs), obs, 0.0)
 
+    @dtypes.usual()
     def reset(key: Key) -> tuple[EnvState, TimeStep]:
         target = jax.eval_shape(task.draw, key).target
         empty = EnvState(
@@ -82,6 +84,7 @@ def batch(
             is_terminal=~everyone,
         )
 
+    @dtypes.usual()
     def step(state: EnvState, action: Array) -> tuple[EnvState, TimeStep]:
         chex.assert_shape(action, (num_envs, spec.action_size))
         due = over(state.steps)
@@ -229,6 +232,7 @@ def select(mask: Array, on_true, on_false):
     return on_true.replace(**fields)
 
 
+@dtypes.usual()
 def obs_spec(task: Task, blank: mjx.Data) -> ArraySpec:
     """Shape and dtype of one observation, without computing one."""
 

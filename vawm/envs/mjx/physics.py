@@ -18,6 +18,7 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
+from vawm.process import dtypes
 from vawm.types import Array
 
 # (iterations, ls_iterations) of the Newton solver, where fewer than in the XML leave the
@@ -89,6 +90,7 @@ def _quiet():
         mujoco.set_mju_user_warning(previous)
 
 
+@dtypes.usual()
 def put(host: mujoco.MjModel, *, solver: tuple[int, int] | None = None) -> Physics:
     """Moves a model to MJX.
 

@@ -22,6 +22,7 @@ import numpy as np
 from vawm.agent import registry
 from vawm.agent.registry import UnknownAgent
 from vawm.config import Config, as_dict, kinds
+from vawm.envs import made as records
 from vawm.errors import InvalidInput
 from vawm.runs import suites, validate
 from vawm.types import ArraySpec, EnvSpec, PyTree
@@ -138,14 +139,23 @@ def version() -> str:
         return "unknown"
 
 
+NUMERIC = {"jax_threefry_partitionable": True, "jax_default_matmul_precision": None}
+"""Settings of JAX that change numbers, and their usual values."""
+
+
 def computed() -> str:
-    """The JAX version and the device of this process."""
-    return f"jax {jax.__version__} on {jax.devices()[0].device_kind}"
+    """The JAX version, the device, and unusual settings that change the numbers."""
+    parts = [f"jax {jax.__version__} on {jax.devices()[0].device_kind}"]
+    for name, usual in NUMERIC.items():
+        if (value := getattr(jax.config, name)) != usual:
+            parts.append(f"{name}={value}")
+    return ", ".join(parts)
 
 
 def spec_as_dict(spec: EnvSpec) -> dict[str, Any]:
     """Converts `spec` for JSON."""
-    return spec._asdict() | {"obs": _obs_as_dict(spec.obs)}
+    content = spec._asdict() | {"obs": _obs_as_dict(spec.obs)}
+    return content | {"made": None if spec.made is None else records.as_dict(spec.made)}
 
 
 def spec_from_dict(content: dict[str, Any]) -> EnvSpec:
@@ -153,8 +163,12 @@ def spec_from_dict(content: dict[str, Any]) -> EnvSpec:
     types: dict[str, type | tuple[type, ...]]
     types = {"task": str, "obs": dict, "action_size": int, "discrete": bool}
     types |= {"num_envs": int, "action_repeat": int, "episode_length": (int, type(None))}
+    types |= {"made": (dict, type(None))}
+    if isinstance(content, dict):
+        content = {"made": None, **content}  # earlier versions did not keep it
     spec = _record(content, types)
-    return EnvSpec(**spec | {"obs": _obs_from_dict(spec["obs"])})
+    made = None if spec["made"] is None else records.from_dict(spec["made"])
+    return EnvSpec(**spec | {"obs": _obs_from_dict(spec["obs"]), "made": made})
 
 
 def leaf_info(leaf: Any) -> LeafInfo:

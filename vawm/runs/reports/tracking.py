@@ -86,9 +86,10 @@ def add(
             continue
         if is_count(name):
             counted[name] = counted.get(name, 0.0) + float(value)
-        else:  # NaN if the chunk had no updates; then skip it
-            chunk = updates * float(value) if updates else 0.0
-            weighted[name] = weighted.get(name, 0.0) + chunk
+        else:  # 0 updates add nothing
+            weighted[name] = weighted.get(name, 0.0) + (
+                updates * float(value) if updates else 0.0
+            )
     return Interval(
         updates=interval.updates + updates,
         weighted=weighted,

@@ -6,12 +6,28 @@ No other code asks which suite a run is of.
 
 from __future__ import annotations
 
-from vawm.config import Config, HostEnvConfig
+import dataclasses
+from typing import Any
+
+from vawm.config import Config, GymnasiumConfig, HostEnvConfig
+from vawm.envs import made as records
 from vawm.envs.protocol import Environment, HostEnvironment
+from vawm.errors import InvalidInput
 from vawm.runs.suites import atari100k, dmc_proprio, dmc_vision, gymnasium
 from vawm.runs.suites.record import Protocol, Suite
+from vawm.types import Made
 
-__all__ = ["SUITES", "Protocol", "Suite", "check_task", "host_choices", "make", "of"]
+__all__ = [
+    "SUITES",
+    "Protocol",
+    "Suite",
+    "check_made",
+    "check_task",
+    "host_choices",
+    "make",
+    "make_again",
+    "of",
+]
 
 SUITES: dict[str, Suite] = {
     "dmc_proprio": dmc_proprio.SUITE,
@@ -42,7 +58,80 @@ def make(config: Config) -> Environment | HostEnvironment:
     Raises:
       InvalidInput: they cannot be made, for example because a package is missing.
     """
-    return of(config).make(config, config.env)
+    return _recorded(config, of(config).make(config, config.env))
+
+
+def _recorded(
+    config: Config, env: Environment | HostEnvironment
+) -> Environment | HostEnvironment:
+    """`env`, which the suite of `config` has made, with a record of that if it has none."""
+    if records.of(env).by != records.OBJECT:
+        return env
+    processes = {field.name for field in dataclasses.fields(HostEnvConfig)}
+    chosen = {n: x for n, x in dataclasses.asdict(config.env).items() if n not in processes}
+    chosen["action_repeat"] = config.action_repeat
+    made = Made(config.suite, config.task, chosen)
+    if isinstance(env, Environment):
+        return env._replace(spec=env.spec._replace(made=made))
+    env.made = made
+    return env
+
+
+def check_made(made: Made | None, *, python: str) -> None:
+    """Refuses environments that were made by code of the caller's.
+
+    Raises:
+      InvalidInput: the remedy names `python`, two statements that use such environments.
+    """
+    if made is not None and not records.can_be_made_again(made):
+        remedy = f"no command can make it again; in Python: {python}"
+        raise InvalidInput("env", records.describe(made), remedy)
+
+
+def make_again(
+    config: Config,
+    made: Made | None,
+    *,
+    task: str,
+    python: str,
+    **changes: Any,
+) -> Environment | HostEnvironment:
+    """The environments that a run was trained in, as its record says. Close those on the host.
+
+    Args:
+      config: of the run; its `num_envs` are made, and its choices count where there is no
+        record.
+      made: the record; None in a run of an earlier version.
+      task: name of the task.
+      python: two statements that do with the caller's own environments what a command
+        cannot, for the remedy.
+      **changes: choices of the suite's environments that differ from those of the run.
+
+    Raises:
+      InvalidInput: they were made by code of the caller's, or cannot be made here.
+    """
+    if made is None:
+        return make(dataclasses.replace(config, env=dataclasses.replace(config.env, **changes)))
+    check_made(made, python=python)
+    if made.by not in SUITES:
+        raise InvalidInput("env", records.describe(made), f"suite {made.by} is unknown here")
+    suite = SUITES[made.by]
+    choices = config.env if type(config.env) is suite.choices else suite.choices()
+    known = {field.name for field in dataclasses.fields(suite.choices)}
+    recorded = {n: value for n, value in made.options.items() if n in known}
+    if suite.choices is GymnasiumConfig:
+        recorded["time_limit"] = made.options.get("time_limit") or 0
+    choices = dataclasses.replace(choices, **recorded | changes)
+    config = dataclasses.replace(
+        config,
+        suite=made.by,
+        task=made.name,
+        action_repeat=made.options.get("action_repeat", config.action_repeat),
+        env=choices,
+    )
+    if suite.choices is GymnasiumConfig:
+        return gymnasium.make(config, choices, task=task, **made.kwargs)  # type: ignore[arg-type]
+    return make(config)
 
 
 def host_choices(config: Config) -> HostEnvConfig | None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from vawm.config import Config, GymnasiumConfig
 from vawm.envs.host import gymnasium
 from vawm.envs.host.pool import Pool
@@ -20,8 +22,13 @@ def check(config: Config, env: GymnasiumConfig) -> None:
         raise InvalidInput("action_repeat", config.action_repeat, remedy)
 
 
-def make(config: Config, env: GymnasiumConfig) -> Pool:
+def make(config: Config, env: GymnasiumConfig, **of_env: Any) -> Pool:
     """The environments of a run, in processes of their own.
+
+    Args:
+      config: of the run.
+      env: its choices of the environments.
+      **of_env: further keyword arguments of `from_gymnasium`.
 
     Raises:
       InvalidInput: also for all that does not fit in the environment, at once.
@@ -33,6 +40,7 @@ def make(config: Config, env: GymnasiumConfig) -> Pool:
         workers=env.workers,
         timeout=env.timeout,
         on_failure=env.on_failure,
+        **of_env,
     )
 
 

@@ -1,0 +1,192 @@
+"""The environments of a run: what it keeps of them, and that commands make the same again."""
+
+import dataclasses
+import functools
+import json
+
+import numpy as np
+import pytest
+import tiny
+import toy
+from refusals import refused
+from runs import save_toy
+
+import vawm.envs
+from vawm import evaluate, export
+from vawm.config import AtariConfig, GymnasiumConfig
+from vawm.envs import made
+from vawm.envs.grid_world import GridWorld
+from vawm.policy import Policy
+from vawm.runs import resume, run_folder, runner, suites
+from vawm.types import Made
+
+HOST = tiny.config(suite="gymnasium", task="CartPole-v1", env=GymnasiumConfig(workers=1))
+
+
+def policy_of(spec, config=HOST):
+    return Policy(config, spec, 0, None, None, None, None)
+
+
+def steps_of_episode(env):
+    """Steps until the first environment's episode ends; every action is the first choice."""
+    env.reset(0)
+    action = np.eye(env.spec.action_size, dtype=np.float32)[np.zeros(env.spec.num_envs, int)]
+    for step in range(1, 1000):
+        env.send(action)
+        if env.receive().is_last[0]:
+            return step
+    return None
+
+
+def spec_of(env):
+    """The spec that a run keeps."""
+    return env.spec._replace(made=made.of(env))
+
+
+def test_a_registered_id_is_made_again_with_its_arguments():
+    given = {"sutton_barto_reward": True}
+    with vawm.envs.from_gymnasium("CartPole-v1", task="mine", time_limit=5, **given) as env:
+        spec = spec_of(env)
+    assert spec.made == Made("gymnasium", "CartPole-v1", {"time_limit": 5}, given)
+    with evaluate.environments(policy_of(spec), episodes=1) as env:
+        assert spec_of(env) == spec
+        assert steps_of_episode(env) == 5
+
+
+def test_a_run_of_an_earlier_version_is_in_the_environment_of_its_config():
+    config = dataclasses.replace(HOST, env=GymnasiumConfig(workers=1, time_limit=3))
+    with evaluate.environments(policy_of(toy.SPEC, config), episodes=1) as env:
+        assert env.spec.task == "CartPole-v1"
+        assert steps_of_episode(env) == 3
+
+
+class Box(dict):
+    """Not JSON, though it looks like it."""
+
+
+@pytest.mark.parametrize(
+    ("make", "kwargs"),
+    [(GridWorld, {}), (functools.partial(GridWorld), {}), ("CartPole-v1", {"x": Box()})],
+)
+def test_what_the_caller_made_is_refused_and_named(make, kwargs):
+    record = made.by_gymnasium(make, options={"time_limit": 7}, kwargs=kwargs)
+    policy = policy_of(toy.SPEC._replace(made=record))
+    lines = ("vawm.load(LOGDIR)", "vawm.evaluate.evaluate(policy, episodes=2, env=...)")
+    with refused("env", made.describe(record), naming=lines):
+        evaluate.by_protocol(policy, episodes=2)
+    assert "GridWorld" in made.describe(record) or "x={}" in made.describe(record)
+    assert "time_limit=7" in made.describe(record)
+    with refused("env", naming="env=..."):
+        evaluate.by_protocol(policy._replace(config=tiny.CONFIG), episodes=2, physics="mujoco")
+
+
+def test_pure_functions_of_the_callers_are_not_taken_for_the_registered_task():
+    own = tiny.env()
+    spec = own.spec._replace(task="walker_walk")
+    record = made.of(own._replace(spec=spec))
+    assert record == Made("object", "vawm.envs.probes.make.<locals>.step")
+    with refused("env", naming="vawm.evaluate.evaluate"):
+        evaluate.by_protocol(policy_of(spec._replace(made=record), tiny.CONFIG), episodes=1)
+
+
+def test_mjx_tasks_are_made_again_with_their_action_repeat():
+    ours = vawm.envs.make("cartpole_balance", num_envs=2, action_repeat=5)
+    spec = spec_of(ours)
+    assert spec.made == Made("dmc_proprio", "cartpole_balance", {"action_repeat": 5})
+    with evaluate.environments(policy_of(spec, tiny.CONFIG), episodes=3) as env:
+        assert spec_of(env) == spec._replace(num_envs=3)
+    other = ours._replace(step=lambda state, action: ours.step(state, action))
+    assert made.of(other).by == "object"
+
+
+def test_choices_of_a_suite_are_made_again():
+    """And `changes` of the protocol still hold."""
+    config = tiny.config(suite="atari100k", task="pong", env=AtariConfig(workers=1))
+    trained = dataclasses.replace(config.env, image_size=48, noops=0, life_loss="terminal")
+    with suites.make(dataclasses.replace(config, env=trained)) as env:
+        spec = spec_of(env)
+    assert (spec.made.by, spec.made.options["image_size"]) == ("atari100k", 48)
+    policy = policy_of(spec, config)
+    with evaluate.environments(policy, episodes=1, life_loss="ignore") as env:
+        options = made.of(env).options
+    assert options == spec.made.options | {"life_loss": "ignore"}
+
+
+def test_the_record_survives_json_and_the_checkpoint(tmp_path):
+    record = Made("gymnasium", "A-v0", {"time_limit": 5}, {"x": [1]}, {"f": "<f>"}, ("W",))
+    assert made.from_dict(json.loads(json.dumps(made.as_dict(record)))) == record
+    save_toy(tmp_path, toy.state(), spec=toy.SPEC._replace(made=record))
+    assert resume.saved_made(tmp_path) == record
+
+
+def test_a_run_without_a_checkpoint_keeps_the_record_in_its_config(tmp_path):
+    record = Made("object", "mine.Line")
+    run_folder.write_config(tmp_path, tiny.CONFIG, record)
+    assert resume.saved_made(tmp_path) == record
+    with refused("env", naming=("saved_config", "resume=True, env=...")):
+        runner.run(tiny.CONFIG, tmp_path, resume=True)
+
+
+SPEC = toy.SPEC._replace(
+    made=Made("gymnasium", "A-v0", {"time_limit": 5}, {"x": 1}, wrappers=("W",))
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("name", {"name": "B-v0"}),
+        ("by", {"by": "object"}),
+        ("time_limit", {"options": {"time_limit": None}}),
+        ("x", {"kwargs": {"x": 2}}),
+        ("x", {"kwargs": {}}),
+        ("wrappers", {"wrappers": ()}),
+    ],
+)
+def test_another_environment_is_refused_on_resume(tmp_path, name, change):
+    save_toy(tmp_path, toy.state(), spec=SPEC)
+    assert resume.check_environments(tmp_path, SPEC) == []
+    now = SPEC._replace(made=SPEC.made._replace(**change))
+    with refused(f"env.{name}"):
+        resume.check_environments(tmp_path, now)
+
+
+def test_another_spec_is_refused_on_resume(tmp_path):
+    save_toy(tmp_path, toy.state(), spec=SPEC)
+    with refused("env.action_size", 4, naming="1"):
+        resume.check_environments(tmp_path, SPEC._replace(action_size=4))
+
+
+@pytest.mark.parametrize(
+    "change", [{"name": "module.Line"}, {"opaque": {"reward": "<function g>"}}]
+)
+def test_what_may_differ_between_equal_environments_is_a_warning(tmp_path, change):
+    then = Made("object", "__main__.Line", opaque={"reward": "<function f>"})
+    save_toy(tmp_path, toy.state(), spec=SPEC._replace(made=then))
+    now = SPEC._replace(made=then._replace(**change))
+    (warning,) = resume.check_environments(tmp_path, now)
+    assert repr(next(iter(change.values()))) in warning or "<function g>" in warning
+
+
+def test_a_run_of_an_earlier_version_is_resumed_in_any_environment_of_its_spec(tmp_path):
+    save_toy(tmp_path, toy.state())
+    assert resume.check_environments(tmp_path, SPEC) == []
+
+
+def test_the_repr_of_an_argument_has_no_address():
+    record = made.by_gymnasium("A-v0", options={}, kwargs={"f": tiny.env, "x": 1})
+    assert record.kwargs == {"x": 1}
+    assert record.opaque == {"f": "<function env>"}
+
+
+@pytest.mark.parametrize("content", [None, {}, {"by": 1}, made.as_dict(SPEC.made) | {"by": 1}])
+def test_a_damaged_record_is_an_error(content):
+    with pytest.raises(ValueError, match=r"how environments were made|wrong type"):
+        made.from_dict(content)
+
+
+def test_the_model_card_names_the_environment():
+    spec = toy.SPEC._replace(made=Made("object", "mine.Line", {"time_limit": 9}))
+    card = export.card(policy_of(spec)._replace(params={}), "Not evaluated.")
+    assert "mine.Line (time_limit=9)" in card
+    assert "your timestep" in card
