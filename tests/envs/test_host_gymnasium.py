@@ -307,6 +307,7 @@ def raises(error):
         ({"reward": jnp.ones(1)}, "reward", "(1,)"),
         ({"terminated": jnp.ones(1, bool)}, "terminated", "(1,)"),
         ({"terminated": None, "reset": raises(OSError("no"))}, "reset()", "OSError: no"),
+        ({"reset": raises(TypeError("a seed is missing"))}, "reset()", "a seed is missing"),
         ({"step": raises(KeyError("x"))}, "step()", "KeyError: 'x'"),
         ({"step": raises(SystemExit("x"))}, "step()", "SystemExit: x"),
         ({"step": lambda action: (0, 0)}, "step()", "2 values"),
@@ -333,10 +334,21 @@ def test_what_goes_wrong_later_in_an_episode_is_a_problem():
     (found,) = texts(Later(), steps=30)
     simulator = GymnasiumSimulator(Later())
     simulator.reset(0)
+    action = np.zeros(2, np.float32)
+    simulator.step(action)
+    simulator.step(action)
     with pytest.raises(Unusable) as error:
-        for _ in range(3):
-            simulator.step(np.zeros(2, np.float32))
+        simulator.step(action)
     assert found == f"{error.value}: {error.value.remedy}"
+
+
+def test_errors_inside_of_a_space_are_told_as_they_are():
+    class Own(spaces.Discrete):
+        def sample(self, mask=None, probability=None):
+            raise LookupError("my own mistake")
+
+    (found,) = texts(Example(action_space=Own(2)), steps=20)
+    assert "LookupError: my own mistake" in found
 
 
 def test_reversed_bounds_are_a_problem():

@@ -131,8 +131,7 @@ def test_a_tuple_is_a_dict_of_numbers():
 
 
 def test_minigrid_is_numbers_without_its_mission():
-    pytest.importorskip("minigrid")
-    env = gymnasium.make("MiniGrid-Empty-5x5-v0")
+    env = gymnasium.make("minigrid:MiniGrid-Empty-5x5-v0")
     reading = read(env.observation_space, image_size=64)
     assert reading.spec == {"direction": vector(4), "image": vector(147)}
     grid, mission = reading.notices

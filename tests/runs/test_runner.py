@@ -18,6 +18,7 @@ import rich.console
 import tiny
 import toy
 from gymnasium.envs.classic_control import CartPoleEnv
+from gymnasium.wrappers import TimeLimit
 from refusals import refused
 from runs import assert_same, events, files_of, lines, measured, quiet
 from tensorboardX.proto.event_pb2 import SessionLog
@@ -615,7 +616,7 @@ def test_environments_on_the_host_are_closed_if_a_run_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ("env", "naming"),
     [
-        (CartPoleEnv(), "from_gymnasium(lambda: CartPoleEnv(...)"),
+        (TimeLimit(CartPoleEnv(), 9), "from_gymnasium(lambda: CartPoleEnv(...)"),
         (CartPoleEnv, "from_gymnasium(CartPoleEnv"),
         ("CartPole-v1", "from_gymnasium('CartPole-v1'"),
         (7, "from_gymnasium"),

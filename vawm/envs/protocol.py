@@ -138,7 +138,8 @@ def check_environment(env: Any) -> None:
         return
     if not isinstance(env, type) and all(hasattr(env, part) for part in parts):
         return
-    make = getattr(env, "__name__", f"lambda: {type(env).__name__}(...)")
+    kind = type(getattr(env, "unwrapped", env))
+    make = getattr(env, "__name__", f"lambda: {kind.__name__}(...)")
     if isinstance(env, str):
         make = repr(env)
     remedy = (
