@@ -189,7 +189,6 @@ def test_a_sound_environment_has_no_problems():
 def test_all_problems_come_at_once():
     class Wrong(Example):
         observation_space = spaces.Dict(
-            board=spaces.Box(0, 5, (20, 20), np.uint8),
             cube=spaces.Box(0, 255, (20, 20, 20), np.uint8),
             real=spaces.Box(0, 1, (64, 64, 3)),
             stack=spaces.Box(0, 255, (4, 84, 84, 3), np.uint8),
@@ -234,7 +233,6 @@ def test_all_problems_come_at_once():
     expected = [
         ("observation_space['nothing']", "(0,)"),
         ("observation_space['stack']", "(4, 84, 84, 3)", "(H, W, C)"),
-        ("observation_space['board']", "(20, 20)", "0 to 5", "0 to 255"),
         ("observation_space['cube']", "(20, 20, 20)", "(H, W, C)"),
         ("observation_space['real']", "(64, 64, 3)", "float32", "uint8"),
         ("observation_space['many']", "1000000", "65536"),

@@ -201,7 +201,6 @@ def test_smaller_grids_of_bytes_are_numbers_and_said_to_be(shape):
 @pytest.mark.parametrize(
     "space",
     [
-        pixels(84, 84, high=1),
         pixels(84, 84, 84),
         pixels(84, 3, 84),
         pixels(4, 84, 84, 3),

@@ -13,8 +13,9 @@
 | `Dict`, `Tuple`, nested     | their entries, named "camera", "0", "robot/joints"            |
 | text                        | nothing; a notice says so                                     |
 
-Bytes are a picture if at least two sides have `SMALLEST_IMAGE` entries. Smaller grids of bytes
-are numbers: a grid of 7 x 7 objects, for example, is no picture.
+Bytes are a picture if at least two sides have `SMALLEST_IMAGE` entries; those of another range
+than 0 to 255 are stretched to it. Smaller grids of bytes are numbers: a grid of 7 x 7 objects,
+for example, is no picture.
 """
 
 from __future__ import annotations
@@ -105,11 +106,16 @@ class Choices(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """Bytes of this shape, as an image of `size` x `size` pixels with channels last."""
+    """Bytes of this shape, as an image of `size` x `size` pixels with channels last.
+
+    Bytes from `low` to `high` are stretched to 0 to 255.
+    """
 
     shape: tuple[int, ...]
     channels: Literal["none", "first", "last"]
     size: int
+    low: int = 0
+    high: int = 255
 
     @property
     def depth(self) -> int:
@@ -127,7 +133,7 @@ class Picture(NamedTuple):
         return image(self.size, channels=self.depth)
 
     def convert(self, name: str, value: Any) -> np.ndarray:
-        """The resized picture; as it is if it has the size.
+        """The resized picture; as it is if it has the size and the whole range of bytes.
 
         Raises:
           Unusable: another shape, or not bytes.
@@ -139,6 +145,8 @@ class Picture(NamedTuple):
         if self.channels == "first":
             array = array.transpose(1, 2, 0)
         array = array.reshape(height, width, self.depth)
+        if (self.low, self.high) != (0, 255):
+            array = stretched(self.low, self.high)[array]
         if (height, width) == (self.size, self.size):
             return array
         return resizer(height, width, self.depth, self.size)(array)
@@ -153,6 +161,13 @@ def resizer(
 ) -> Callable[[np.ndarray], np.ndarray]:
     """`make_resize`, remembered: its weights are not part of a pickled reading."""
     return make_resize(RESIZE, height=height, width=width, size=size, channels=channels)
+
+
+@functools.cache
+def stretched(low: int, high: int) -> np.ndarray:
+    """`[256]` uint8: what each byte becomes, 0 at `low` and 255 at `high`."""
+    share = (np.arange(256) - low) / max(1, high - low)
+    return np.rint(255 * np.clip(share, 0, 1)).astype(np.uint8)
 
 
 class Entry(NamedTuple):
@@ -326,16 +341,13 @@ def of_box(box: Any, image_size: int) -> Kind | str:
         return Numbers(shape)
     if len(shape) > 3:
         return f"has bytes of shape {shape}: stack pictures along the channels, (H, W, C)"
-    if not ((box.low == 0).all() and (box.high == 255).all()):
-        bounds = f"from {box.low.min()} to {box.high.max()}"
-        remedy = "declare 0 to 255 if it is a picture, flatten it if it is not"
-        return f"has the shape of a picture, {shape}, but bytes {bounds}: {remedy}"
+    low, high = int(box.low.min()), int(box.high.max())
     if len(shape) == 2:
-        return Picture(shape, "none", image_size)
+        return Picture(shape, "none", image_size, low, high)
     if shape[2] < min(shape[:2]):
-        return Picture(shape, "last", image_size)
+        return Picture(shape, "last", image_size, low, high)
     if shape[0] < min(shape[1:]):
-        return Picture(shape, "first", image_size)
+        return Picture(shape, "first", image_size, low, high)
     remedy = "put the channels last, (H, W, C), or flatten it if it is not a picture"
     return f"has bytes of shape {shape}, of which no side can be the channels: {remedy}"
 
@@ -346,12 +358,16 @@ def empty(shape: tuple[int, ...]) -> str:
 
 def notice_of(kind: Kind, space: Any) -> str:
     """What a user should know of how an entry is read, or ""."""
-    if isinstance(kind, Picture) and kind.sides != (kind.size, kind.size):
+    if isinstance(kind, Picture):
         height, width = kind.sides
-        return (
-            f"has pictures of {height} x {width} pixels: they are resized to {kind.size} x "
-            f"{kind.size} (image_size) by Pillow's {RESIZE} filter"
-        )
+        changes = []
+        if (kind.low, kind.high) != (0, 255):
+            changes.append(f"bytes from {kind.low} to {kind.high} are stretched to 0 to 255")
+        if (height, width) != (kind.size, kind.size):
+            new = f"{kind.size} x {kind.size} (image_size) by Pillow's {RESIZE} filter"
+            changes.append(f"they are resized to {new}")
+        if changes:
+            return f"has pictures of {height} x {width} pixels: {'; '.join(changes)}"
     if isinstance(kind, Numbers) and space.dtype == np.uint8 and len(kind.shape) > 1:
         sides = " x ".join(map(str, kind.shape))
         return f"has {sides} bytes, too few for a picture: they are read as numbers"
