@@ -39,7 +39,7 @@ from vawm.config import (
     ValueAlignmentConfig,
     VisionConfig,
 )
-from vawm.envs.protocol import check_positive
+from vawm.envs.protocol import check_image_size, check_positive
 from vawm.errors import InvalidInput
 from vawm.learning import from_replay, train
 from vawm.learning.collector import make_collect
@@ -51,7 +51,6 @@ from vawm.runs import budget, validate
 from vawm.runs.suites import dmc_vision
 from vawm.sweep.overhead import peak_process_bytes, percent_more, quartiles
 from vawm.types import Batch, EnvSpec, Trajectory, image, vector
-from vawm.world_model.codecs import check_image_size
 
 
 @dataclass(frozen=True)

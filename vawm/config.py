@@ -367,6 +367,8 @@ class GymnasiumConfig(HostEnvConfig):
 
     time_limit: int = 0
     """steps after which an episode is truncated; 0 for the environment's own limit"""
+    image_size: int = 64
+    """pixels a side to which pictures are resized, by Pillow's bilinear filter as for Atari"""
 
 
 AgentName = Annotated[str, "a name in vawm.agent.registry"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 
@@ -12,13 +12,45 @@ class InvalidInput(ValueError):
 
     Raised before anything is compiled, allocated or written. Command lines print the
     message and exit with code 2.
+
+    Attributes:
+      settings: choices of the caller's that the remedy names, as `assignment` writes them.
+        Whoever passes them on under another name renames them with `reworded`.
     """
 
-    def __init__(self, field: str, value: Any, remedy: str):
+    def __init__(
+        self, field: str, value: Any, remedy: str, settings: Mapping[str, Any] | None = None
+    ):
         super().__init__(f"{field}={value!r}: {remedy}")
         self.field = field
         self.value = value
         self.remedy = remedy
+        self.settings = dict(settings or {})
+
+
+def assignment(name: str, value: Any) -> str:
+    """A choice as Python writes it: `time_limit=1000`."""
+    return f"{name}={value!r}"
+
+
+def reworded(text: str, settings: Mapping[str, Any], how: Callable[[str, Any], str]) -> str:
+    """`text` in which `how(name, value)` stands in the place of each assignment."""
+    for name, value in settings.items():
+        text = text.replace(assignment(name, value), how(name, value))
+    return text
+
+
+def within(part: str, error: InvalidInput) -> InvalidInput:
+    """The same error for somebody who makes the settings in a part of a config.
+
+    `time_limit=1000` becomes `env.time_limit=1000`, if the part is `env`.
+    """
+    names = {name: f"{part}.{name}" for name in error.settings}
+    remedy = reworded(
+        error.remedy, error.settings, lambda name, value: assignment(names[name], value)
+    )
+    settings = {names[name]: value for name, value in error.settings.items()}
+    return InvalidInput(error.field, error.value, remedy, settings)
 
 
 def suggestion(value: object, choices: Iterable[str]) -> str:

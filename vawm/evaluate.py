@@ -23,7 +23,12 @@ import jax
 from vawm import envs
 from vawm.cli import flags
 from vawm.cli.command_line import guard
-from vawm.envs.protocol import Environment, HostEnvironment, check_positive
+from vawm.envs.protocol import (
+    Environment,
+    HostEnvironment,
+    check_environment,
+    check_positive,
+)
 from vawm.errors import InvalidInput
 from vawm.policy import Policy, load, play, scores
 from vawm.policy.play import How, Score
@@ -57,6 +62,7 @@ def evaluate(
       EnvironmentFailure: an environment on the host failed.
     """
     check(episodes, seed)
+    check_environment(env)
     check_env(policy, env)
     if not isinstance(env, Environment):
         return play.on_host(env, policy, episodes=episodes, seed=seed, how=how)

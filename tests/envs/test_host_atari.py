@@ -548,6 +548,24 @@ def test_an_unknown_game_is_refused_with_the_nearest(name, nearest):
         simulate(name)
 
 
+@pytest.mark.parametrize(
+    ("name", "game"),
+    [
+        ("ALE/Breakout-v5", "breakout"),
+        ("BreakoutNoFrameskip-v4", "breakout"),
+        ("Breakout-v4", "breakout"),
+        ("Breakout-ram-v4", "breakout"),
+        ("ALE/MsPacman-v5", "ms_pacman"),
+        ("ALE/MsPacmanNoFrameskip-v4", "ms_pacman"),
+        ("UpNDownDeterministic-v0", "up_n_down"),
+        ("ALE/Zaxxon-v5", "alien, amidar"),
+    ],
+)
+def test_an_id_of_gymnasium_is_answered_with_the_name_of_its_game(name, game):
+    with refused("game", name, naming=[game, "gymnasium_task.py"]):
+        atari.check_game(name)
+
+
 def test_a_game_outside_of_the_26_is_refused():
     with refused("game", "zaxxon", naming="alien, amidar"):
         atari.check_game("zaxxon")

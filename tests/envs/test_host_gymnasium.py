@@ -1,8 +1,10 @@
 """Gymnasium environments as simulators, and the problems found in them."""
 
 import time
+from fractions import Fraction
 
 import gymnasium
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -11,6 +13,7 @@ from refusals import refused
 
 from vawm import envs
 from vawm.envs.host.gymnasium import (
+    PACKAGES,
     GymnasiumSimulator,
     check_id,
     from_gymnasium,
@@ -18,7 +21,26 @@ from vawm.envs.host.gymnasium import (
     problems,
 )
 from vawm.envs.host.pool import EnvironmentFailure, episode_seed
+from vawm.envs.host.usable import Unusable
 from vawm.types import image, vector
+
+
+def least(space):
+    """Zeros in a space, the first choices, and the text "here"."""
+    if isinstance(space, spaces.Dict):
+        return {key: least(inner) for key, inner in space.items()}
+    if isinstance(space, spaces.Tuple):
+        return tuple(map(least, space))
+    if isinstance(space, spaces.Text):
+        return "here"
+    if isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)):
+        return space.start.copy() if space.shape else int(space.start)
+    return np.zeros(space.shape, space.dtype)
+
+
+def texts(env, **limits):
+    """The problems of an environment, as texts."""
+    return [problem.text for problem in problems(env, **limits)]
 
 
 class Example(gymnasium.Env):
@@ -38,12 +60,7 @@ class Example(gymnasium.Env):
         self.seen = []
 
     def show(self):
-        if hasattr(self, "obs"):
-            return self.obs
-        space = self.observation_space
-        if isinstance(space, spaces.Dict):
-            return {key: np.zeros(box.shape, box.dtype) for key, box in space.items()}
-        return np.zeros(space.shape, space.dtype)
+        return self.obs if hasattr(self, "obs") else least(self.observation_space)
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -70,7 +87,7 @@ class Example(gymnasium.Env):
         (spaces.Box(0, 255, (128,), np.uint8), vector(128)),
         (spaces.Box(0, 255, (4, 7), np.uint8), vector(28)),
         (spaces.Box(0, 255, (15, 15), np.uint8), vector(225)),
-        (spaces.Box(0, 255, (48, 48), np.uint8), image(48, channels=1)),
+        (spaces.Box(0, 255, (64, 64), np.uint8), image(64, channels=1)),
         (spaces.Box(0, 255, (64, 64, 3), np.uint8), image(64)),
         (spaces.Box(0, 255, (7, 7, 3), np.uint8), vector(147)),
         (spaces.Box(0, 1, (40, 40), np.float32), vector(1600)),
@@ -79,7 +96,6 @@ class Example(gymnasium.Env):
 def test_an_observation_is_an_image_or_a_vector(box, spec):
     simulator = GymnasiumSimulator(Example(observation_space=box))
     assert simulator.obs == spec
-    simulator.reset(0)
     for obs in (simulator.reset(0), simulator.step(np.zeros(2, np.float32)).obs):
         assert (obs.shape, obs.dtype) == (spec.shape, spec.dtype)
 
@@ -92,7 +108,7 @@ def test_the_numbers_of_an_observation_keep_their_order():
         table=spaces.Box(0, 9, (2, 3), np.float64),
     )
     env = Example(observation_space=space, obs={"picture": picture, "table": table})
-    simulator = GymnasiumSimulator(env)
+    simulator = GymnasiumSimulator(env, image_size=48)
     assert simulator.obs == {"picture": image(48, channels=1), "table": vector(6)}
     obs = simulator.reset(0)
     np.testing.assert_array_equal(obs["picture"][..., 0], picture)
@@ -126,9 +142,21 @@ def test_discrete_actions_start_at_the_start_of_their_space():
     assert all(action in env.action_space for action in env.seen)
 
 
-@pytest.mark.parametrize("reward", [2, 2.0, np.float64(2), np.int32(2), np.array(2.0)])
-def test_rewards_and_ends_are_passed_on(reward):
-    simulator = GymnasiumSimulator(TimeLimit(Example(reward=reward), 12))
+SCALARS = [2, 2.0, np.float64(2), np.int32(2), np.array(2.0), jnp.float32(2), Fraction(2)]
+
+
+@pytest.mark.parametrize("reward", SCALARS)
+@pytest.mark.parametrize("flag", [bool, np.bool_, np.array, jnp.array])
+def test_rewards_and_ends_are_numbers_and_flags_of_any_library(reward, flag):
+    """For the look and for the run."""
+
+    class Other(Example):
+        def step(self, action):
+            obs, reward, over, _, info = super().step(action)
+            return obs, reward, flag(over), flag(False), info
+
+    assert problems(Other(reward=reward), steps=30) == []
+    simulator = GymnasiumSimulator(TimeLimit(Other(reward=reward), 12))
     simulator.reset(0)
     outcomes = [simulator.step(np.zeros(2, np.float32)) for _ in range(12)]
     assert all(outcome.reward == 2 for outcome in outcomes)
@@ -161,22 +189,21 @@ def test_a_sound_environment_has_no_problems():
 def test_all_problems_come_at_once():
     class Wrong(Example):
         observation_space = spaces.Dict(
-            big=spaces.Box(0, 255, (64, 64, 3), np.uint8),
-            small=spaces.Box(0, 255, (48, 48, 3), np.uint8),
-            odd=spaces.Box(0, 255, (84, 84, 3), np.uint8),
-            board=spaces.Box(0, 255, (20, 20), np.uint8),
+            cube=spaces.Box(0, 255, (20, 20, 20), np.uint8),
             real=spaces.Box(0, 1, (64, 64, 3)),
-            first=spaces.Box(0, 255, (3, 64, 64), np.uint8),
-            wide=spaces.Box(0, 255, (64, 96, 3), np.uint8),
             stack=spaces.Box(0, 255, (4, 84, 84, 3), np.uint8),
-            choice=spaces.Discrete(4),
+            choice=spaces.Discrete(4, start=1),
+            choices=spaces.MultiDiscrete([2, 3]),
+            many=spaces.Discrete(10**6),
+            graph=spaces.Graph(spaces.Box(0, 1, (2,)), None),
+            sequence=spaces.Sequence(spaces.Box(0, 1, (2,))),
             nothing=spaces.Box(0, 1, (0,)),
             double=spaces.Box(-1, 1, (2,)),
             shape=spaces.Box(-1, 1, (2,)),
             nan=spaces.Box(-1, 1, (2,)),
             far=spaces.Box(-1, 1, (2,)),
             list=spaces.Box(-1, 1, (2,)),
-            missing=spaces.Box(-1, 1, (2,)),
+            big=spaces.Box(-np.inf, np.inf, (2,), np.float64),
         )
         action_space = spaces.Box(-np.inf, np.inf, (2,))
 
@@ -184,8 +211,14 @@ def test_all_problems_come_at_once():
             return self.show()
 
         def show(self):
+            known = self.observation_space.spaces.items()
             return {
-                **{key: x for key, x in super().show().items() if key != "missing"},
+                **{key: least(x) for key, x in known if key not in ("graph", "sequence")},
+                "graph": None,
+                "sequence": (),
+                "choice": 5,
+                "choices": np.array([1, 3]),
+                "big": np.array([0, -1e39]),
                 "double": np.zeros(2),
                 "shape": np.zeros((2, 1), np.float32),
                 "nan": np.float32([0, np.nan]),
@@ -196,21 +229,21 @@ def test_all_problems_come_at_once():
         def step(self, action):
             return self.show(), np.ones(1), 0, {}
 
-    found = problems(Wrong())
+    found = texts(Wrong())
     expected = [
-        ("observation_space['choice']", "Discrete(4)", "Box"),
-        ("observation_space['first']", "(3, 64, 64)", "TransformObservation"),
         ("observation_space['nothing']", "(0,)"),
         ("observation_space['stack']", "(4, 84, 84, 3)", "(H, W, C)"),
-        ("observation_space['wide']", "(64, 96, 3)", "ResizeObservation"),
-        ("observation_space['odd']", "84", "ResizeObservation"),
-        ("observation_space['board']", "20", "ResizeObservation"),
+        ("observation_space['cube']", "(20, 20, 20)", "(H, W, C)"),
         ("observation_space['real']", "(64, 64, 3)", "float32", "uint8"),
-        ("images", "{'big': 64, 'small': 48}", "ResizeObservation"),
+        ("observation_space['many']", "1000000", "65536"),
+        ("observation_space['graph']", "Graph", "Box"),
+        ("observation_space['sequence']", "Sequence", "Box"),
         ("action space", "Box(-inf, inf, (2,), float32)", "low and high"),
         ("reset()", "seed=None"),
         ("reset()", "one value", "dict", "obs, info"),
-        ("obs has keys", "'missing'"),
+        ("obs['choice']", "5"),
+        ("obs['choices'][1]", "3"),
+        ("obs['big'][1]", "-1e+39", "float32"),
         ("obs['double']", "float64", ".astype(np.float32)"),
         ("obs['far'][1]", "3"),
         ("obs['list']", "list", "float32"),
@@ -228,6 +261,10 @@ def test_all_problems_come_at_once():
         assert all(": " in text for text in ours), ours  # the remedy
 
 
+FLAG = spaces.Discrete(2)
+"""A space with two choices."""
+
+
 def raises(error):
     def method(*args, **kwargs):
         raise error
@@ -238,9 +275,22 @@ def raises(error):
 @pytest.mark.parametrize(
     ("changes", "start", "part"),
     [
-        ({"observation_space": spaces.Discrete(4)}, "observation space", "Discrete(4)"),
         ({"observation_space": spaces.Tuple([]), "obs": ()}, "observation space", "Tuple()"),
-        ({"observation_space": spaces.Dict()}, "observation space", "empty Dict"),
+        ({"observation_space": spaces.Dict()}, "observation space", "Dict()"),
+        ({"observation_space": spaces.Text(9)}, "observation space", "Text("),
+        (
+            {"observation_space": spaces.Dict({1: FLAG})},
+            "observation_space[1]",
+            "key",
+        ),
+        (
+            {"observation_space": spaces.Dict({"a/0": FLAG, "a": spaces.Tuple([FLAG])})},
+            "observation_space",
+            "'a/0'",
+        ),
+        ({"observation_space": spaces.Dict(a=FLAG), "obs": {}}, "obs ", "'a'"),
+        ({"observation_space": spaces.Tuple([FLAG]), "obs": (1, 1)}, "obs ", "2"),
+        ({"observation_space": spaces.Tuple([FLAG]), "obs": 1}, "obs ", "int"),
         ({"observation_space": None, "obs": 0}, "observation space", "None"),
         ({"action_space": spaces.MultiDiscrete([2, 3])}, "action space", "MultiDiscrete"),
         ({"action_space": spaces.Box(0, 5, (2,), np.int32)}, "action space", "int32"),
@@ -249,7 +299,13 @@ def raises(error):
         ({"obs": np.full(3, np.inf, np.float32)}, "obs[0]", "inf"),
         ({"reward": None}, "reward", "None"),
         ({"reward": float("nan")}, "reward", "nan"),
+        ({"reward": 3.5e38}, "reward", "float32"),
+        ({"reward": 10**400}, "reward", "finite"),
+        ({"reward": "1"}, "reward", "'1'"),
+        ({"reward": jnp.ones(1)}, "reward", "(1,)"),
+        ({"terminated": jnp.ones(1, bool)}, "terminated", "(1,)"),
         ({"terminated": None, "reset": raises(OSError("no"))}, "reset()", "OSError: no"),
+        ({"reset": raises(TypeError("a seed is missing"))}, "reset()", "a seed is missing"),
         ({"step": raises(KeyError("x"))}, "step()", "KeyError: 'x'"),
         ({"step": raises(SystemExit("x"))}, "step()", "SystemExit: x"),
         ({"step": lambda action: (0, 0)}, "step()", "2 values"),
@@ -258,16 +314,45 @@ def raises(error):
     ],
 )
 def test_a_problem_is_named_with_a_remedy(changes, start, part):
-    (found,) = problems(Example(**changes), steps=100)
+    (found,) = texts(Example(**changes), steps=100)
     assert found.startswith(start)
     assert part in found
     assert ": " in found
 
 
+def test_what_goes_wrong_later_in_an_episode_is_a_problem():
+    """For the look and for the run, by the same words."""
+
+    class Later(Example):
+        observation_space = spaces.Box(-np.inf, np.inf, (1,), np.float64)
+
+        def show(self):
+            return np.array([1e39 if self.steps == 3 else 0.0])
+
+    (found,) = texts(Later(), steps=30)
+    simulator = GymnasiumSimulator(Later())
+    simulator.reset(0)
+    action = np.zeros(2, np.float32)
+    simulator.step(action)
+    simulator.step(action)
+    with pytest.raises(Unusable) as error:
+        simulator.step(action)
+    assert found == f"{error.value}: {error.value.remedy}"
+
+
+def test_errors_inside_of_a_space_are_told_as_they_are():
+    class Own(spaces.Discrete):
+        def sample(self, mask=None, probability=None):
+            raise LookupError("my own mistake")
+
+    (found,) = texts(Example(action_space=Own(2)), steps=20)
+    assert "LookupError: my own mistake" in found
+
+
 def test_reversed_bounds_are_a_problem():
     box = spaces.Box(-1, 1, (2,))
     box.low, box.high = box.high, box.low
-    (found,) = problems(Example(action_space=box))
+    (found,) = texts(Example(action_space=box))
     assert found.startswith("action space")
     assert "low" in found
     assert "high" in found
@@ -281,7 +366,7 @@ def test_an_environment_of_the_old_api_is_understood_behind_wrappers():
         return np.zeros(3, np.float32)
 
     env = TimeLimit(Example(step=step, reset=reset), 50)
-    of_reset, of_step = problems(env)
+    of_reset, of_step = texts(env)
     assert of_reset.startswith("reset()")
     assert "ndarray" in of_reset
     assert of_step.startswith("step()")
@@ -289,13 +374,17 @@ def test_an_environment_of_the_old_api_is_understood_behind_wrappers():
 
 
 def test_an_object_of_another_kind_is_one_problem():
-    (found,) = problems(object())
+    (found,) = texts(object())
     assert "builtins.object" in found
     assert "gymnasium.Env" in found
+    (found,) = texts(Example)
+    assert "class Example" in found
+    (found,) = texts(gymnasium.make_vec("CartPole-v1", num_envs=2))
+    assert "num_envs" in found
 
 
 def test_an_empty_environment_has_a_problem_everywhere():
-    observation, action, reset, play = problems(type("Bare", (gymnasium.Env,), {})())
+    observation, action, reset, play = texts(type("Bare", (gymnasium.Env,), {})())
     assert observation.startswith("observation_space raised AttributeError")
     assert action.startswith("action_space raised AttributeError")
     assert reset.startswith("reset()")
@@ -397,6 +486,7 @@ def test_an_environment_that_cannot_be_made_is_refused():
         ("CartPole-v7", "'CartPole-v1'"),
         ("CartPole", "'CartPole-v1'"),
         ("cartpole-v1", "'CartPole-v1'"),
+        ("ALE/Brekout-v5", "'ALE/Breakout-v5'"),
         ("xyz", "id"),
         ("not_there:Env-v0", "'not_there'"),
     ],
@@ -413,6 +503,51 @@ def test_an_impossible_time_limit_is_refused():
 
 def test_a_module_in_an_id_is_imported():
     assert check_id("gymnasium:CartPole-v1").id == "CartPole-v1"
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "ALE/Breakout-v5",
+        "BreakoutNoFrameskip-v4",
+        "Breakout-v4",
+        "MiniGrid-Empty-5x5-v0",
+        "BabyAI-GoToRedBall-v0",
+    ],
+)
+def test_the_package_of_a_well_known_id_is_imported(name):
+    assert check_id(name).id == name
+
+
+def test_a_package_that_is_not_there_is_named(monkeypatch):
+    monkeypatch.setitem(PACKAGES, "Nowhere-.+", "not_installed")
+    with refused("env", "Nowhere-v0", naming="pip install not_installed"):
+        check_id("Nowhere-v0")
+
+
+@pytest.mark.parametrize(
+    ("env", "naming"),
+    [
+        (TimeLimit(Example(), 5), "lambda: Example(...)"),
+        (gymnasium.make("CartPole-v1"), "'CartPole-v1'"),
+        (gymnasium.make_vec("CartPole-v1", num_envs=2), "num_envs"),
+        (spaces.Discrete(2), "Discrete"),
+    ],
+)
+def test_an_environment_in_place_of_what_makes_it_is_the_mistake(env, naming):
+    with refused("make", env, naming=naming):
+        from_gymnasium(env)
+
+
+def test_the_look_names_the_setting_that_is_missing():
+    with refused("env", "Example", naming="time_limit=1000") as refusal:
+        from_gymnasium(Example, terminated=False)
+    assert refusal.value.settings == {"time_limit": 1000}
+
+
+def test_sizes_that_no_network_reads_are_refused():
+    with refused("image_size", 60):
+        from_gymnasium("CartPole-v1", image_size=60)
 
 
 def test_a_task_is_named_after_what_makes_it():

@@ -2,6 +2,7 @@
 
 import contextlib
 import gc
+import importlib.util
 import os
 import pathlib
 import re
@@ -18,7 +19,7 @@ import pytest
 from host_simulators import BadEnd, Chance, Changed, Echo, Parent, Slow, Troubled, Walk
 from refusals import refused
 
-from vawm.envs.host import channel, pool, worker
+from vawm.envs.host import channel, pool, usable, worker
 from vawm.envs.host.pool import EnvironmentFailure, Episodes, Pool, episode_seed
 from vawm.envs.host.simulator import Outcome
 from vawm.errors import InvalidInput
@@ -213,7 +214,7 @@ def test_an_impossible_seed_is_refused(walks, seed):
         ({"reward": float("nan")}, "reward .*nan"),
         ({"reward": 1e39}, r"reward .*1e\+39"),
         ({"reward": None}, "reward .*None"),
-        ({"reward": np.ones(1)}, r"reward .*array\(\[1.\]\)"),
+        ({"reward": np.ones(1)}, r"reward .*\(1,\)"),
         ({"is_last": 1}, "is_last .*1"),
         ({"is_terminal": None}, "is_terminal .*None"),
         ({"obs": np.float32([0, np.inf])}, r"obs\[1\] .*inf"),
@@ -252,7 +253,36 @@ def test_an_observation_without_all_its_entries_is_named(obs):
 
 def test_rewards_may_be_numpy_scalars():
     for reward in (np.float64(2), np.int8(2), np.array(2.0), True + True):
-        assert worker.check_reward(reward) == 2
+        assert usable.check_number("reward", reward) == 2
+
+
+def test_a_class_in_a_module_that_workers_cannot_import_is_named(tmp_path, monkeypatch):
+    """Such as one that was loaded from its file, or whose folder left the path."""
+    path = tmp_path / "hidden_walk.py"
+    path.write_text("from host_simulators import Walk\nclass Hidden(Walk): pass\n")
+    spec = importlib.util.spec_from_file_location("hidden_walk", path)
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, "hidden_walk", module)
+    spec.loader.exec_module(module)
+    with refused("make", "hidden_walk", naming=["ModuleNotFoundError", "PYTHONPATH"]):
+        Pool(module.Hidden, task="walk", num_envs=1)
+
+
+def test_a_simulator_in_place_of_what_makes_it_is_the_mistake():
+    walk = Walk()
+    with refused("make", walk, naming="lambda: Walk(...)"):
+        Pool(walk, task="walk", num_envs=1)
+
+
+def test_a_pool_passes_on_the_notices_of_its_simulators():
+    class Noted(Walk):
+        notices = ("the picture is small",)
+
+    with Pool(Noted, task="walk", num_envs=2, workers=1) as envs:
+        assert envs.notices == ("the picture is small",)
+        assert envs.reset(0).is_first.all()
+    with Pool(Walk, task="walk", num_envs=1) as envs:
+        assert envs.notices == ()
 
 
 def lone_worker(simulator, begins=True):

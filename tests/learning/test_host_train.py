@@ -221,7 +221,8 @@ def test_an_environment_that_fails_ends_the_run_in_one_line(tmp_path):
     assert text.startswith("environment 1, episode 7, step ")
     assert "OSError: the lamp is broken" in text
     assert "checkpoint at 32" in text
-    assert "--env.on-failure restart" in text
+    assert "on_failure='restart'" in text
+    assert error.value.settings == {"on_failure": "restart"}
     assert "\n" not in text
     assert isinstance(error.value.__cause__, EnvironmentFailure)
 

@@ -10,6 +10,7 @@ import tiny
 
 from vawm import presets
 from vawm.agent import make_agent, with_size
+from vawm.cli import flags
 from vawm.envs import probes
 from vawm.errors import InvalidInput
 from vawm.learning import host_train, image_store, train
@@ -78,6 +79,7 @@ def test_what_does_not_fit_is_refused_with_the_largest_replay_that_would():
         "replay.capacity=5000: needs 1.95 GiB for a run that fills 1000 of it, 1.46 GiB are"
     )
     assert str(error.value).endswith("use replay.capacity=500 at most")
+    assert flags.in_flags(error.value).endswith("use --replay.capacity 500 at most")
 
 
 @pytest.mark.parametrize("images", [0, 3000 * 2**20])
@@ -144,6 +146,7 @@ def test_five_million_images_are_refused_with_the_numbers(monkeypatch):
     assert error.value.field == "replay.capacity"
     assert "70.00 GiB are free (replay 7" in str(error.value)  # latents take the rest
     assert error.value.remedy.endswith("or replay.images='host' if that has more memory")
+    assert "--replay.images host" in flags.in_flags(error.value)
 
 
 def test_images_on_the_host_are_counted_there(monkeypatch):

@@ -17,6 +17,8 @@ import pytest
 import rich.console
 import tiny
 import toy
+from gymnasium.envs.classic_control import CartPoleEnv
+from gymnasium.wrappers import TimeLimit
 from refusals import refused
 from runs import assert_same, events, files_of, lines, measured, quiet
 from tensorboardX.proto.event_pb2 import SessionLog
@@ -96,7 +98,7 @@ def stored(reward=()):
 def fake(monkeypatch):
     """Replaces training by a `FakeStep` with the given losses."""
 
-    def install(loss=lambda env_steps: env_steps):
+    def install(loss=lambda env_steps: env_steps, notices=()):
         trainer = Trainer(
             spec=toy.SPEC,
             agent=None,
@@ -106,6 +108,7 @@ def fake(monkeypatch):
             episodes=lambda: None,
             resume=lambda state, _: (state, 0),
             close=lambda: None,
+            notices=notices,
         )
         monkeypatch.setattr(runner, "prepare", lambda *_: trainer)
 
@@ -628,6 +631,7 @@ def test_bad_input_is_refused_with_nothing_written(tmp_path, changes):
 def test_environments_on_the_host_are_closed_if_a_run_is_refused(tmp_path):
     class Host:
         closed = 0
+        spec = reset = send = receive = None
 
         def close(self):
             self.closed += 1
@@ -636,6 +640,28 @@ def test_environments_on_the_host_are_closed_if_a_run_is_refused(tmp_path):
     with refused("num_envs", 0):
         runner.run(tiny.config(num_envs=0), tmp_path / "run", env=env)
     assert env.closed == 1
+
+
+@pytest.mark.parametrize(
+    ("env", "naming"),
+    [
+        (TimeLimit(CartPoleEnv(), 9), "from_gymnasium(lambda: CartPoleEnv(...)"),
+        (CartPoleEnv, "from_gymnasium(CartPoleEnv"),
+        ("CartPole-v1", "from_gymnasium('CartPole-v1'"),
+        (7, "from_gymnasium"),
+    ],
+)
+def test_what_is_no_environment_is_the_mistake(tmp_path, env, naming):
+    with refused("env", env, naming=naming):
+        runner.run(tiny.CONFIG, tmp_path / "run", env=env)
+    assert not (tmp_path / "run").exists()
+
+
+def test_what_to_know_of_the_environments_is_said_at_the_start(tmp_path, fake):
+    fake(notices=("the text is left out",))
+    console = quiet()
+    run(tiny.config(env_steps=56), tmp_path, console=console)
+    assert "note: the text is left out\n" in console.file.getvalue()
 
 
 def test_environments_that_cannot_be_started_are_one_line(tmp_path, monkeypatch):

@@ -7,6 +7,7 @@ import importlib.util
 import pathlib
 
 import pytest
+from refusals import refused
 
 import vawm
 from vawm import envs, presets
@@ -86,6 +87,7 @@ def test_presets_of_pixels_and_of_the_paper_can_be_named(experiment):
     ("suite", "flags", "message"),
     [
         ("atari100k", ["--game", "brekout"], "game='brekout': did you mean 'breakout'?"),
+        ("atari100k", ["--task", "ALE/Pong-v5"], "game='ALE/Pong-v5': use 'pong', "),
         ("atari100k", ["--env.stiky", "1"], "--env.stiky='1': no such flag; did you mean"),
         ("atari100k", ["--env.sticky", "2"], "env.sticky=2.0: use a number from 0 up to"),
         ("atari100k", ["--agent", "strom"], "agent='strom': did you mean 'storm'? use"),
@@ -93,6 +95,7 @@ def test_presets_of_pixels_and_of_the_paper_can_be_named(experiment):
         ("dmc_vision", ["--env.image-size", "84"], "env.image_size=84: use a multiple of 16"),
         ("dmc_vision", ["--env.renderer", "glx"], "--env.renderer='glx': did you mean 'egl'"),
         ("gymnasium", ["--task", "CartPole-v7"], "env='CartPole-v7': "),
+        ("gymnasium", ["--env.image-size", "84"], "env.image_size=84: use a multiple of 16"),
         ("dmc_proprio", ["--env.sticky", "0.2"], "--env.sticky='0.2': no such flag"),
         ("dmc_proprio", ["--suite", "atari100k"], "suite='atari100k': this program runs"),
         ("dmc_proprio", ["--replay.images", "host"], "replay.images='host': there are no"),
@@ -105,6 +108,23 @@ def test_bad_input_is_one_line_and_code_2(experiment, suite, flags, message, cap
     assert output.err.count("\n") == 1
     assert not output.out
     assert not list(pathlib.Path().iterdir())
+
+
+def test_remedies_name_fields_in_python_and_flags_on_the_command_line(capsys):
+    """A problem of the look, with the setting that ends it."""
+    env = dataclasses.replace(presets.GYMNASIUM_QUICK.env, workers=1)
+    config = dataclasses.replace(presets.GYMNASIUM_QUICK, task="CliffWalking-v1", env=env)
+    with refused("env", "CliffWalking-v1", naming="env.time_limit=1000") as refusal:
+        suites.make(config)
+    assert refusal.value.settings == {"env.time_limit": 1000}
+
+    def fail():
+        raise refusal.value
+
+    assert command_line.guard(fail) == 2
+    text = capsys.readouterr().err
+    assert "--env.time-limit 1000" in text
+    assert "time_limit" not in text
 
 
 def test_a_run_of_another_suite_is_not_resumed(experiment, tmp_path, capsys):

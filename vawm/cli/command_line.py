@@ -260,10 +260,10 @@ def guard(main: Callable[[], int]) -> int:
     try:
         return main()
     except InvalidInput as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {flags.in_flags(error)}", file=sys.stderr)
         return 2
     except (RunError, SaveError, EnvironmentFailure) as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {flags.in_flags(error)}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)

@@ -20,7 +20,7 @@ import tyro
 
 from vawm.agent import plugins, registry
 from vawm.config import AgentName, Config
-from vawm.errors import InvalidInput, suggestion
+from vawm.errors import InvalidInput, reworded, suggestion
 
 T = TypeVar("T")
 
@@ -132,6 +132,15 @@ def kinds(cls: type) -> dict[str, Any]:
 def choices(cls: type, name: str) -> tuple[str, ...]:
     """What a field that is a `Literal` may be."""
     return typing.get_args(kinds(cls)[name])
+
+
+def in_flags(error: Exception) -> str:
+    """The message of an error, with flags in the place of the choices that it names.
+
+    `env.time_limit=1000` becomes `--env.time-limit 1000`.
+    """
+    settings = getattr(error, "settings", {})
+    return reworded(str(error), settings, lambda name, value: f"{_dashed('--' + name)} {value}")
 
 
 def _dashed(flag: str) -> str:

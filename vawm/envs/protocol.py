@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from vawm.errors import InvalidInput
-from vawm.types import Array, EnvSpec, Key, Made, TimeStep
+from vawm.types import IMAGE_SIZES, Array, EnvSpec, Key, Made, TimeStep
 
 
 class EnvState(NamedTuple):
@@ -57,6 +57,7 @@ class HostEnvironment(Protocol):
       spec: what an agent has to know; static.
       restarts: number of restarts after a failure so far.
       made: how they were made; may be missing, if nobody says so.
+      notices: lines to say when a run starts; may be missing.
     """
 
     spec: EnvSpec
@@ -113,3 +114,37 @@ def check_positive(field: str, value: Any) -> None:
     """Refuses anything that is not a whole number of at least 1."""
     if isinstance(value, bool) or not isinstance(value, int) or value < 1:
         raise InvalidInput(field, value, "use a whole number of at least 1")
+
+
+def check_image_size(name: str, size: int) -> None:
+    """Refuses images that cannot be halved four times, as the CNNs do.
+
+    Raises:
+      InvalidInput: names sizes that can.
+    """
+    if size not in IMAGE_SIZES:
+        low, high, step = IMAGE_SIZES[0], IMAGE_SIZES[-1], IMAGE_SIZES.step
+        remedy = f"use a multiple of {step} from {low} to {high}, such as 64, 96 or 128"
+        raise InvalidInput(name, size, remedy)
+
+
+def check_environment(env: Any) -> None:
+    """Refuses what is neither pure functions nor a host environment, such as Gymnasium's.
+
+    Raises:
+      InvalidInput: names `from_gymnasium`, which makes a host environment.
+    """
+    parts = ("spec", "reset", "send", "receive")
+    if isinstance(env, Environment):
+        return
+    if not isinstance(env, type) and all(hasattr(env, part) for part in parts):
+        return
+    kind = type(getattr(env, "unwrapped", env))
+    make = getattr(env, "__name__", f"lambda: {kind.__name__}(...)")
+    if isinstance(env, str):
+        make = repr(env)
+    remedy = (
+        f"is neither an Environment nor a HostEnvironment: pass from_gymnasium({make}, "
+        "num_envs=...), if it is of Gymnasium"
+    )
+    raise InvalidInput("env", env, remedy)

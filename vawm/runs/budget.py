@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import pathlib
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 
@@ -13,7 +13,7 @@ from vawm.agent import registry
 from vawm.agent.registry import Activations
 from vawm.config import Config, HostEnvConfig
 from vawm.envs.host.crew import cores
-from vawm.errors import InvalidInput
+from vawm.errors import InvalidInput, assignment
 from vawm.runs import suites
 from vawm.runs.checkpoint.manifest import leaf_info
 from vawm.types import ArraySpec, EnvSpec, PyTree, is_image
@@ -290,13 +290,16 @@ def _too_large(need: Estimate, free: int, config: Config, smallest: int) -> Inva
     step = need.copies * rings / need.replay_capacity
     rest = need.total - need.copies * rings
     largest = int((free - rest) / step)
+    settings: dict[str, Any] = {}
     if largest < smallest:
         remedy = "no replay is small enough: use a smaller size or batch, or fewer num_envs"
     else:
-        remedy = f"use replay.capacity={largest} at most"
+        settings["replay.capacity"] = largest
+        remedy = f"use {assignment('replay.capacity', largest)} at most"
     if need.where == "device" and jax.default_backend() != "cpu" and _could_move(config):
-        remedy += ", or replay.images='host' if that has more memory"
-    return InvalidInput("replay.capacity", config.replay.capacity, numbers + remedy)
+        settings["replay.images"] = "host"
+        remedy += f", or {assignment('replay.images', 'host')} if that has more memory"
+    return InvalidInput("replay.capacity", config.replay.capacity, numbers + remedy, settings)
 
 
 def _could_move(config: Config) -> bool:

@@ -23,8 +23,13 @@ import rich.console
 from vawm.agent import registry
 from vawm.config import Config
 from vawm.envs import made
-from vawm.envs.protocol import Environment, EnvironmentFailure, HostEnvironment
-from vawm.errors import InvalidInput
+from vawm.envs.protocol import (
+    Environment,
+    EnvironmentFailure,
+    HostEnvironment,
+    check_environment,
+)
+from vawm.errors import InvalidInput, assignment
 from vawm.process import names, signals, streams
 from vawm.runs import budget, checkpoint, diagnosis, run_folder, settings, suites, validate
 from vawm.runs.checkpoint import manifest
@@ -39,7 +44,15 @@ from vawm.types import PyTree
 
 
 class RunError(RuntimeError):
-    """A run had to stop; its last checkpoint is intact."""
+    """A run had to stop; its last checkpoint is intact.
+
+    Attributes:
+      settings: choices of the config that the message names, see `errors.assignment`.
+    """
+
+    def __init__(self, message: str, **settings: Any):
+        super().__init__(message)
+        self.settings = settings
 
 
 class Progress(NamedTuple):
@@ -117,8 +130,10 @@ def run(
     logdir = checkpoint.expanded(logdir)
     console = console or rich.console.Console()
     say = functools.partial(console.print, highlight=False, soft_wrap=True, markup=False)
+    if env is not None:
+        check_environment(env)
     with contextlib.ExitStack() as stack:
-        stack.enter_context(_explained(logdir))
+        stack.enter_context(_explained(logdir, known_task=env is None))
         if not isinstance(env, Environment | None):
             stack.enter_context(contextlib.closing(env))
         by_command = env is None
@@ -132,6 +147,8 @@ def run(
         stack.enter_context(run_folder.claim(logdir, say=say))
         if banner:
             say(banner)
+        for notice in trainer.notices:
+            say(f"note: {notice}")
         if resume and checkpoint.latest(logdir):
             state, progress = _continue(logdir, trainer, say)
             run_folder.write_config(logdir, config, trainer.spec.made)
@@ -426,7 +443,7 @@ def _stop(
 
 
 @contextlib.contextmanager
-def _explained(logdir: pathlib.Path):
+def _explained(logdir: pathlib.Path, *, known_task: bool):
     """Turns errors of memory, environments and the disk into a `RunError` with one line.
 
     A checkpoint that cannot be written raises `SaveError`.
@@ -443,8 +460,13 @@ def _explained(logdir: pathlib.Path):
         remedy = "use a smaller replay.capacity or batch, or a machine with more memory"
         raise RunError(f"out of memory on the host: {remedy} ({error})") from error
     except EnvironmentFailure as error:
-        remedy = "to start a new episode instead, use --env.on-failure restart"
-        raise RunError(f"{error}; kept: {checkpoint.kept(logdir)}; {remedy}") from error
+        settings = {"env.on_failure" if known_task else "on_failure": "restart"}
+        remedy = " ".join(assignment(*setting) for setting in settings.items())
+        remedy = f"to start a new episode instead, use {remedy}"
+        if not known_task:
+            remedy += " where you make the environments"
+        text = f"{error}; kept: {checkpoint.kept(logdir)}; {remedy}"
+        raise RunError(text, **settings) from error
     except OSError as error:
         full = error.errno == errno.ENOSPC
         free = f" ({checkpoint.free_space(logdir)} free)" if full else ""

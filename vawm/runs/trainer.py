@@ -56,6 +56,7 @@ class Trainer(NamedTuple):
       resume: `(state, episodes) -> (state, count)`, restores the environments; `count`
         episodes could not be replayed and start again.
       close: stops the environments on the host.
+      notices: what to say of the environments when a run starts, one line each.
     """
 
     spec: EnvSpec
@@ -66,6 +67,7 @@ class Trainer(NamedTuple):
     episodes: Callable[[], Arrays | None]
     resume: Callable[[TrainState, Arrays | None], tuple[TrainState, int]]
     close: Callable[[], None]
+    notices: tuple[str, ...] = ()
 
 
 def make(
@@ -171,4 +173,5 @@ def on_host(
         episodes=lambda: env.episodes()._asdict(),
         resume=resume,
         close=env.close,
+        notices=tuple(getattr(env, "notices", ())),
     )

@@ -13,9 +13,10 @@ import jax
 import jax.numpy as jnp
 
 from vawm import nets
+from vawm.envs.protocol import check_image_size
 from vawm.errors import InvalidInput
 from vawm.losses.transforms import symlog
-from vawm.types import IMAGE_SIZES, Array, EnvSpec, Key, PyTree, is_image
+from vawm.types import Array, EnvSpec, Key, PyTree, is_image
 
 
 class Codec(NamedTuple):
@@ -202,15 +203,3 @@ def check_obs(obs: PyTree) -> None:
         sizes.add(shape[0])
     if len(sizes) > 1:
         raise InvalidInput("obs", sorted(sizes), "give all images of an observation one size")
-
-
-def check_image_size(name: str, size: int) -> None:
-    """Refuses images that cannot be halved four times, as the CNNs do.
-
-    Raises:
-      InvalidInput: names sizes that can.
-    """
-    if size not in IMAGE_SIZES:
-        low, high, step = IMAGE_SIZES[0], IMAGE_SIZES[-1], IMAGE_SIZES.step
-        remedy = f"use a multiple of {step} from {low} to {high}, such as 64, 96 or 128"
-        raise InvalidInput(name, size, remedy)

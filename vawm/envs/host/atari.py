@@ -12,6 +12,7 @@ The semantics are DreamerV3's, with these differences:
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
@@ -51,6 +52,9 @@ GAMES = {
     "up_n_down": "UpNDown",
 }
 """Name of the ROM -> name in score tables."""
+
+ID = r"(ALE/)?(?P<title>[A-Z]\w*?)(-ram)?(-?NoFrameskip|-?Deterministic)?(-ram)?-v\d"
+"""Gymnasium's ids of games: "ALE/Breakout-v5", "BreakoutNoFrameskip-v4", "Breakout-ram-v4"."""
 
 LIFE_LOSSES = ("ignore", "terminal", "end")
 NOOP = 0  # ALE's number for the action that does nothing, in every game
@@ -199,10 +203,19 @@ class AtariSimulator:
 
 
 def check_game(name: str) -> None:
-    """Refuses a name outside `GAMES` and suggests the nearest one."""
+    """Refuses a name outside `GAMES`; names the game of an id, else the nearest one.
+
+    Raises:
+      InvalidInput: with the name to use.
+    """
     if name in GAMES:
         return
     remedy = f"{suggestion(name, GAMES)}choose one of {', '.join(GAMES)}"
+    if found := re.fullmatch(ID, name):
+        game = next((game for game, title in GAMES.items() if title == found["title"]), None)
+        remedy = f"use {game!r}, which is this game" if game else f"is not among them; {remedy}"
+        # Its frame skip and sticky actions are not those of Atari 100k.
+        remedy += "; to play by the id itself, use suite gymnasium (gymnasium_task.py)"
     raise InvalidInput("game", name, remedy)
 
 

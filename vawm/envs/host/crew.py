@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from vawm.envs.host.channel import Channel, Fields, create_file, reserve, view
+from vawm.envs.host.usable import one_line
 from vawm.envs.host.worker import (
     IDLE,
     TELL,
@@ -29,7 +30,6 @@ from vawm.envs.host.worker import (
     Description,
     Trouble,
     control_fields,
-    one_line,
 )
 from vawm.errors import InvalidInput
 

@@ -20,9 +20,9 @@ PRECISION = 22  # fractional bits of Pillow's weights for 8-bit images
 
 
 def make_resize(
-    method: str, *, height: int, width: int, size: int
+    method: str, *, height: int, width: int, size: int, channels: int = 3
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """Builds the function that resizes RGB frames to `size` x `size` pixels.
+    """Builds the function that resizes frames to `size` x `size` pixels, each channel alone.
 
     bilinear: Pillow's `Image.resize(..., BILINEAR)`. An antialiased triangle filter, first
       across, then down, rounded to bytes after each, in fixed point. Exact.
@@ -35,9 +35,10 @@ def make_resize(
       height: rows of a frame.
       width: pixels in a row of a frame.
       size: pixels per side of the result.
+      channels: numbers per pixel.
 
     Returns:
-      `(frame [height, width, 3] uint8) -> [size, size, 3] uint8`, a fresh array.
+      `(frame [height, width, channels] uint8) -> [size, size, channels] uint8`, a fresh array.
 
     Raises:
       InvalidInput: an unknown method, or "area" with a larger size (OpenCV interpolates).
@@ -50,13 +51,14 @@ def make_resize(
     between = to_byte if method == "bilinear" else unchanged
     end = to_byte if method == "bilinear" else np.rint
     down = sparse.csr_array(weights(height, size))
-    # Colours stay adjacent: a row has `width * 3` numbers, and a pixel three columns.
-    across = sparse.csr_array(np.kron(weights(width, size), np.eye(3, dtype=down.dtype)))
+    # Channels stay adjacent: a row has `width * channels` numbers, a pixel `channels` columns.
+    apart = sparse.eye_array(channels, dtype=down.dtype)
+    across = sparse.csr_array(sparse.kron(sparse.csr_array(weights(width, size)), apart))
 
     def resize(frame: np.ndarray) -> np.ndarray:
-        columns = frame.reshape(height, width * 3).T.astype(down.dtype, order="C")
-        columns = between(across @ columns)  # [size * 3, height]
-        return end(down @ columns.T).astype(np.uint8).reshape(size, size, 3)
+        columns = frame.reshape(height, width * channels).T.astype(down.dtype, order="C")
+        columns = between(across @ columns)  # [size * channels, height]
+        return end(down @ columns.T).astype(np.uint8).reshape(size, size, channels)
 
     return resize
 

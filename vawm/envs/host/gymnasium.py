@@ -12,7 +12,10 @@ from __future__ import annotations
 import contextlib
 import functools
 import importlib
+import importlib.util
 import math
+import re
+import sys
 from collections.abc import Callable, Mapping
 from typing import Any, Literal, cast
 
@@ -23,63 +26,70 @@ from gymnasium.envs.registration import EnvSpec as RegisteredEnv
 from gymnasium.wrappers import TimeLimit
 
 from vawm.envs import made
-from vawm.envs.host.gymnasium_check import pixels, problems, refuse, space_problems
-from vawm.envs.host.pool import Pool
+from vawm.envs.host.atari import GAMES
+from vawm.envs.host.gymnasium_check import IMAGE_SIZE, problems, refuse, space_problems
+from vawm.envs.host.pool import Pool, check_maker
+from vawm.envs.host.reading import read
 from vawm.envs.host.simulator import Outcome, Simulator
-from vawm.envs.host.worker import one_line
-from vawm.envs.protocol import check_positive
+from vawm.envs.host.usable import check_flag, one_line
+from vawm.envs.protocol import check_image_size, check_positive
 from vawm.errors import InvalidInput, suggestion
-from vawm.types import ArraySpec, PyTree, image, vector
+from vawm.types import PyTree
+
+PACKAGES = {
+    r"ALE/.+": "ale_py",
+    r"\w+(-ram)?(NoFrameskip|Deterministic)-v\d": "ale_py",
+    rf"({'|'.join(GAMES.values())})(-ram)?-v\d": "ale_py",
+    r"(MiniGrid|BabyAI)-.+": "minigrid",
+}
+"""Pattern of ids -> the package that registers them when it is imported."""
 
 
 class GymnasiumSimulator:
     """A Gymnasium environment as a `Simulator`.
 
     Actions: [-1, 1] is scaled to the bounds of a `Box`; a `Discrete` keeps its choices.
-    Observations: a `Box`, or a `Dict` of boxes, which keeps its keys. Square uint8 images
-    stay images and get a channel axis if they have none; any other `Box` becomes a float32
-    vector. `terminated` sets `is_terminal` and `is_last`; `truncated` sets `is_last`.
+    Observations: as `vawm.envs.host.reading` says. `terminated` sets `is_terminal` and
+    `is_last`; `truncated` sets `is_last`.
     """
 
-    def __init__(self, env: gymnasium.Env):
+    def __init__(self, env: gymnasium.Env, image_size: int = IMAGE_SIZE):
         """Takes over `env`.
+
+        Args:
+          env: the environment.
+          image_size: pixels a side to which pictures are resized.
 
         Raises:
           InvalidInput: its spaces are not supported.
         """
-        refuse(str(env), space_problems(env))
+        refuse(str(env), space_problems(env, image_size))
         self._env = env
-        self._seen: Any = env.observation_space
+        self._reading = read(env.observation_space, image_size=image_size)
         actions = cast(Any, env.action_space)
         self._actions = actions
+        self.obs: PyTree = self._reading.spec
+        self.notices = self._reading.notices
         self.discrete = isinstance(actions, spaces.Discrete)
         self.action_size = int(actions.n) if self.discrete else math.prod(actions.shape)
         self.episode_length: int | None = None  # it may end earlier than its time limit
-        if isinstance(self._seen, spaces.Dict):
-            self.obs: PyTree = {key: array_spec(box) for key, box in self._seen.items()}
-        else:
-            self.obs = array_spec(self._seen)
 
     def reset(self, seed: int) -> PyTree:
         obs, _ = self._env.reset(seed=seed)
-        return self._observation(obs)
+        return self._reading.convert(obs)
 
     def step(self, action: np.ndarray | int) -> Outcome:
         obs, reward, terminated, truncated, _ = self._env.step(self._action(action))
+        is_terminal = check_flag("terminated", terminated)
         return Outcome(
-            obs=self._observation(obs),
+            obs=self._reading.convert(obs),
             reward=reward,  # type: ignore[arg-type]  # a number, as the pool makes sure
-            is_last=bool(terminated) or bool(truncated),
-            is_terminal=bool(terminated),
+            is_last=check_flag("truncated", truncated) or is_terminal,
+            is_terminal=is_terminal,
         )
 
     def close(self) -> None:
         self._env.close()
-
-    def _observation(self, obs: Any) -> PyTree:
-        if isinstance(self._seen, spaces.Dict):
-            return {key: to_array(obs[key], box) for key, box in self._seen.items()}
-        return to_array(obs, self._seen)
 
     def _action(self, action: np.ndarray | int) -> Any:
         """The environment's action for an action in [-1, 1] or for an index."""
@@ -103,6 +113,7 @@ def from_gymnasium(
     on_failure: Literal["raise", "restart"] = "raise",
     check: bool = True,
     task: str | None = None,
+    image_size: int = IMAGE_SIZE,
     **kwargs: Any,
 ) -> Pool:
     """Runs N copies of a Gymnasium environment in separate processes.
@@ -116,31 +127,40 @@ def from_gymnasium(
       workers: processes; see `Pool`, also for `timeout` and `on_failure`.
       check: whether to look for `problems` first, with one extra environment.
       task: name of the task; default the name of `make`.
+      image_size: pixels a side to which pictures are resized, a multiple of 16 from 48 to 256.
       **kwargs: for `gymnasium.make`, or for the function.
 
     Returns:
       A `Pool`; the caller must close it.
 
     Raises:
-      InvalidInput: an unknown id, an impossible number, or a list of all problems.
+      InvalidInput: an unknown id, an impossible number, an environment in the place of what
+        makes it, or a list of all problems.
       EnvironmentFailure: the environment could not be made.
     """
     if time_limit is not None:
         check_positive("time_limit", time_limit)
+    check_image_size("image_size", image_size)
+    check_source(make)
     source = check_id(make) if isinstance(make, str) else make
     task = task or name_of(make)
     make_env = functools.partial(make_environment, source, task, time_limit, kwargs)
     pool = Pool(
-        functools.partial(simulate, make_env),
+        functools.partial(simulate, make_env, image_size),
         task=task,
         num_envs=num_envs,
         workers=workers,
         timeout=timeout,
         on_failure=on_failure,
-        first=functools.partial(check_and_simulate, make_env, task) if check else None,
+        first=functools.partial(check_and_simulate, make_env, task, image_size)
+        if check
+        else None,
     )
     pool.made = made.by_gymnasium(
-        make, options={"time_limit": time_limit}, kwargs=kwargs, wrappers=wrappers_of(source)
+        make,
+        options={"time_limit": time_limit, "image_size": image_size},
+        kwargs=kwargs,
+        wrappers=wrappers_of(source),
     )
     return pool
 
@@ -152,24 +172,69 @@ def wrappers_of(source: RegisteredEnv | Callable[..., Any]) -> tuple[str, ...]:
     return tuple(wrapper.name for wrapper in source.additional_wrappers)
 
 
+def check_source(make: Any) -> None:
+    """Refuses an environment in the place of what makes it.
+
+    Raises:
+      InvalidInput: shows a function that makes it.
+    """
+    if isinstance(make, gymnasium.vector.VectorEnv):
+        remedy = "is several environments: pass what makes a single one, and num_envs"
+        raise InvalidInput("make", make, remedy)
+    if not isinstance(make, gymnasium.Env):
+        if not isinstance(make, str):
+            check_maker(make, "the environment")
+        return
+    name = type(make.unwrapped).__name__
+    example = f"lambda: {name}(...)"
+    if make.spec is not None:
+        example += f", or the id {make.spec.id!r}"
+    remedy = f"is an environment, not what makes it: pass the class or a function, as {example}"
+    raise InvalidInput("make", make, remedy)
+
+
 def check_id(name: str) -> RegisteredEnv:
     """The environment registered under an id; "module:id" imports the module first.
 
+    The packages of `PACKAGES` are imported for their ids.
+
     Raises:
-      InvalidInput: the id is not registered; suggests the nearest one.
+      InvalidInput: the id is not registered; suggests the nearest one, or what to install.
     """
     module, _, registered = name.rpartition(":")
+    package = package_of(registered)
     if module:
-        try:
-            importlib.import_module(module)
-        except Exception as error:  # a module may raise anything
-            remedy = f"module {module!r} cannot be imported: {one_line(error)}"
-            raise InvalidInput("env", name, remedy) from None
+        import_quietly(module, name)
+    elif registered not in gymnasium.registry and package:
+        if importlib.util.find_spec(package) is None:
+            remedy = f"is an id of a package that is not installed: pip install {package}"
+            raise InvalidInput("env", name, remedy.replace("ale_py", "ale-py"))
+        import_quietly(package, name)
     if registered in gymnasium.registry:
         return gymnasium.registry[registered]
     hint = suggestion(registered, gymnasium.registry)
     remedy = f"{hint}use a registered id, or 'module:id' to import the module that registers it"
     raise InvalidInput("env", name, remedy)
+
+
+def package_of(registered: str) -> str:
+    """The package that registers an id, if it is known; "" if not."""
+    known = (package for ids, package in PACKAGES.items() if re.fullmatch(ids, registered))
+    return next(known, "")
+
+
+def import_quietly(module: str, name: str) -> None:
+    """Imports a module for the id `name`; what it prints goes to standard error.
+
+    Raises:
+      InvalidInput: it cannot be imported.
+    """
+    try:
+        with contextlib.redirect_stdout(sys.stderr):
+            importlib.import_module(module)
+    except Exception as error:  # a module may raise anything
+        remedy = f"module {module!r} cannot be imported: {one_line(error)}"
+        raise InvalidInput("env", name, remedy) from None
 
 
 def name_of(make: str | Callable[..., Any]) -> str:
@@ -204,42 +269,22 @@ def make_environment(
         raise InvalidInput("env", task, f"cannot be made: {one_line(error)}") from error
 
 
-def simulate(make_env: Callable[[], gymnasium.Env]) -> Simulator:
+def simulate(make_env: Callable[[], gymnasium.Env], image_size: int) -> Simulator:
     """Makes a simulator."""
-    return GymnasiumSimulator(make_env())
+    return GymnasiumSimulator(make_env(), image_size)
 
 
-def check_and_simulate(make_env: Callable[[], gymnasium.Env], task: str) -> Simulator:
+def check_and_simulate(
+    make_env: Callable[[], gymnasium.Env], task: str, image_size: int
+) -> Simulator:
     """Checks a separate environment, then makes a simulator.
 
     Raises:
       InvalidInput: lists all problems.
     """
     env = make_env()
-    found = problems(env)
+    found = problems(env, image_size=image_size)
     with contextlib.suppress(Exception):
         env.close()
     refuse(task, found)
-    return simulate(make_env)
-
-
-def array_spec(box: Any) -> ArraySpec:
-    """Shape and dtype of what `to_array` returns."""
-    if not pixels(box):
-        return vector(math.prod(box.shape))
-    return image(box.shape[0], channels=box.shape[2] if len(box.shape) == 3 else 1)
-
-
-def to_array(obs: Any, box: Any) -> np.ndarray:
-    """Converts an observation of a `Box` to its `array_spec`.
-
-    Raises:
-      ValueError: its shape is not that of the space.
-    """
-    if pixels(box):
-        array = np.asarray(obs)  # the pool refuses a wrong dtype or shape
-        return array[..., None] if len(box.shape) == 2 else array
-    array = np.asarray(obs, np.float32)
-    if array.shape != box.shape:
-        raise ValueError(f"observation has shape {array.shape}, but its space {box.shape}")
-    return array.reshape(-1)
+    return simulate(make_env, image_size)

@@ -10,27 +10,43 @@ import contextlib
 import functools
 import time
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple, Protocol
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
 
-from vawm.envs.host.worker import one_line
-from vawm.errors import InvalidInput
-from vawm.types import IMAGE_SIZES
+from vawm.envs.host.reading import Entry, Reading, find, label, read
+from vawm.envs.host.usable import Unusable, check_flag, check_number, first, one_line
+from vawm.errors import InvalidInput, assignment
 
-SMALLEST_IMAGE = 16
-"""Pixels per side from which a uint8 array counts as an image."""
 TOLERANCE = 1e-4
 """How far observations may leave their bounds, relative to max(1, |bound|), for rounding."""
 
-Add = Callable[[str, str], Any]
-"""Takes a kind of problem and its text; only the first of each kind is kept."""
+IMAGE_SIZE = 64
+"""Pixels a side to which pictures are resized, unless somebody chooses another size."""
 
 
-def problems(env: gymnasium.Env, *, steps: int = 1000, seconds: float = 5.0) -> list[str]:
+class Problem(NamedTuple):
+    """What is wrong and its remedy, in one clause.
+
+    `settings` are choices of `from_gymnasium` that the text names, see `errors.assignment`.
+    """
+
+    text: str
+    settings: Mapping[str, Any] = {}
+
+
+class Add(Protocol):
+    """Takes a kind of problem, its text and its settings; keeps the first of each kind."""
+
+    def __call__(self, kind: str, text: str, **settings: Any) -> None: ...
+
+
+def problems(
+    env: gymnasium.Env, *, steps: int = 1000, seconds: float = 5.0, image_size: int = IMAGE_SIZE
+) -> list[Problem]:
     """Everything that makes an environment unusable for training, each with a remedy.
 
     Plays random actions, always the same ones. Never raises; does not close `env`.
@@ -39,105 +55,55 @@ def problems(env: gymnasium.Env, *, steps: int = 1000, seconds: float = 5.0) -> 
       env: the environment; do not use it afterwards.
       steps: number of actions to play.
       seconds: time after which it stops playing.
+      image_size: pixels a side to which pictures are resized.
     """
     if not isinstance(env, gymnasium.Env):
-        kind = f"{type(env).__module__}.{type(env).__qualname__}"
-        return [f"the environment is a {kind}: derive it from gymnasium.Env"]
-    return look_at(
-        env,
-        {
-            "observation_space": look_at_observation_space,
-            "action_space": look_at_action_space,
-            "random play": functools.partial(try_out, steps=steps, seconds=seconds),
-        },
-    )
+        return [Problem(what_it_is(env))]
+    play = functools.partial(try_out, steps=steps, seconds=seconds, image_size=image_size)
+    return look_at(env, {**looks_at_spaces(image_size), "random play": play})
 
 
-def space_problems(env: gymnasium.Env) -> list[str]:
+def what_it_is(made: Any) -> str:
+    """What was made in the place of an environment, with the remedy."""
+    if isinstance(made, gymnasium.vector.VectorEnv):
+        kind = type(made).__name__
+        return f"the environment is a {kind} of several: make a single one, and pass num_envs"
+    if isinstance(made, type):
+        return f"the environment is the class {made.__name__}: make an object of it"
+    kind = f"{type(made).__module__}.{type(made).__qualname__}"
+    return f"the environment is a {kind}: derive it from gymnasium.Env"
+
+
+def space_problems(env: gymnasium.Env, image_size: int = IMAGE_SIZE) -> list[Problem]:
     """The `problems` of an environment's spaces, found without playing."""
-    return look_at(
-        env,
-        {
-            "observation_space": look_at_observation_space,
-            "action_space": look_at_action_space,
-        },
-    )
+    return look_at(env, looks_at_spaces(image_size))
 
 
-def look_at(env: gymnasium.Env, looks: Mapping[str, Callable[..., None]]) -> list[str]:
+def looks_at_spaces(image_size: int) -> dict[str, Callable[..., None]]:
+    """Name of each space of an environment -> its check."""
+    look = functools.partial(look_at_observation_space, image_size=image_size)
+    return {"observation_space": look, "action_space": look_at_action_space}
+
+
+def look_at(env: gymnasium.Env, looks: Mapping[str, Callable[..., None]]) -> list[Problem]:
     """Runs some checks and returns their problems; a check that raises is a problem too."""
-    found: dict[str, str] = {}
+    found: dict[str, Problem] = {}
+
+    def add(kind: str, text: str, **settings: Any) -> None:
+        found.setdefault(kind, Problem(text, settings))
+
     for name, look in looks.items():
         try:
-            look(env, found.setdefault)
+            look(env, add)
         except (Exception, SystemExit) as error:
-            found[name] = f"{name} raised {one_line(error)}: fix the environment"
+            found[name] = Problem(f"{name} raised {one_line(error)}: fix the environment")
     return list(found.values())
 
 
-def look_at_observation_space(env: gymnasium.Env, add: Add) -> None:
-    """Checks for a `Box` or a `Dict` of them, with square images of one size."""
-    space: Any = env.observation_space
-    if not isinstance(space, spaces.Dict):
-        if text := box_problem(space):
-            add("observation_space", f"observation space {text}")
-        return
-    if not space.spaces:
-        add("observation_space", "observation space is an empty Dict: add a Box")
-    boxes: dict[Any, Any] = dict(space.items())
-    for key, entry in boxes.items():
-        name = f"observation_space[{key!r}]"
-        if not isinstance(key, str):
-            add(name, f"{name} has a key that is not a string: use a string")
-        if text := box_problem(entry):
-            add(name, f"{name} {text}")
-    sides = {
-        key: box.shape[0] for key, box in boxes.items() if not box_problem(box) and pixels(box)
-    }
-    if len(set(sides.values())) > 1:
-        remedy = "resize them to one size with gymnasium.wrappers.ResizeObservation"
-        add("image sizes", f"images differ in size, {sides} pixels per side: {remedy}")
-
-
-def box_problem(space: Any) -> str:
-    """The problem of an observation space with its remedy, or ""."""
-    if not isinstance(space, spaces.Box):
-        remedy = "return a Box from an ObservationWrapper"
-        if isinstance(space, spaces.Space) and space.is_np_flattenable:
-            remedy = "use gymnasium.wrappers.FlattenObservation, or return a Box"
-        return f"is {space!s:.100}, not a Box: {remedy}"
-    shape = space.shape
-    if 0 in shape:
-        return f"has shape {shape}, so it is empty: remove it"
-    if len(shape) < 2:
-        return ""
-    if space.dtype != np.uint8:
-        if sorted(shape)[-2] < IMAGE_SIZES[0]:
-            return ""
-        remedy = "declare uint8 if it is an image, flatten it if it is not"
-        return f"has the shape of an image, {shape}, but dtype {space.dtype}: {remedy}"
-    if len(shape) > 3:
-        return f"has uint8 of shape {shape}: stack frames along the channels, (H, W, C)"
-    if len(shape) == 3 and shape[0] < SMALLEST_IMAGE <= shape[1] == shape[2]:
-        remedy = "move channels last with gymnasium.wrappers.TransformObservation"
-        return f"has images of shape {shape}, channels first: {remedy}"
-    if not pixels(space):
-        return ""
-    remedy = "use gymnasium.wrappers.ResizeObservation"
-    if shape[0] != shape[1]:
-        return f"has images of shape {shape}, not square: {remedy}"
-    if shape[0] not in IMAGE_SIZES:
-        sizes = f"a multiple of {IMAGE_SIZES.step} from {IMAGE_SIZES[0]} to {IMAGE_SIZES[-1]}"
-        remedy += ", or FlattenObservation if it is not an image"
-        return f"has images with {shape[0]} pixels per side, not {sizes}: {remedy}"
-    return ""
-
-
-def pixels(box: Any) -> bool:
-    """Whether a `Box` without problems holds images."""
-    if box.dtype != np.uint8 or len(box.shape) not in (2, 3):
-        return False
-    return min(box.shape[:2]) >= SMALLEST_IMAGE
+def look_at_observation_space(env: gymnasium.Env, add: Add, *, image_size: int) -> None:
+    """Checks that every part of the space can be read."""
+    for name, text in read(env.observation_space, image_size=image_size).problems:
+        add(name, text)
 
 
 def look_at_action_space(env: gymnasium.Env, add: Add) -> None:
@@ -161,8 +127,18 @@ def look_at_action_space(env: gymnasium.Env, add: Add) -> None:
         add("action_space", "action space has low above high: swap them")
 
 
-def try_out(env: gymnasium.Env, add: Add, *, steps: int, seconds: float) -> None:
-    """Plays seeded random actions and checks all returned values."""
+def try_out(
+    env: gymnasium.Env, add: Add, *, steps: int, seconds: float, image_size: int
+) -> None:
+    """Plays seeded random actions and checks all returned values, as the run will."""
+
+    @functools.cache
+    def reading() -> Reading:
+        return read(env.observation_space, image_size=image_size)
+
+    def look(obs: Any) -> None:
+        look_at_observation(obs, env.observation_space, reading(), add)
+
     limited = has_time_limit(env)
     with contextlib.suppress(Exception):  # sampling will show the problem
         env.action_space.seed(0)
@@ -172,7 +148,7 @@ def try_out(env: gymnasium.Env, add: Add, *, steps: int, seconds: float) -> None
         if time.monotonic() > end:
             return  # too slow to tell whether an episode ends
         if over:
-            begun = begin(playing, episode, add)
+            begun = begin(playing, episode, look, add)
             if begun is None:
                 return
             playing, episode = begun, episode + 1
@@ -192,14 +168,15 @@ def try_out(env: gymnasium.Env, add: Add, *, steps: int, seconds: float) -> None
             remedy = "fix step(); random actions reproduce it"
             add("step", f"step() raised {one_line(error)}: {remedy}")
             return
-        over = look_at_step(result, playing.observation_space, add)
+        over = look_at_step(result, look, add)
         ended |= over
     if not ended and not limited:
         missing = f"no episode ended within {steps} random steps, and there is no time limit"
-        add("end", f"{missing}: pass time_limit=")
+        limit = {"time_limit": 1000}
+        add("end", f"{missing}: set one, such as {assignment('time_limit', 1000)}", **limit)
 
 
-def look_at_step(result: Any, space: Any, add: Add) -> bool:
+def look_at_step(result: Any, look: Callable[[Any], None], add: Add) -> bool:
     """Checks what `step` returned; returns whether the episode is over."""
     five = "return obs, reward, terminated, truncated, info"
     if isinstance(result, tuple) and len(result) == 4:  # the API of gym before 0.26
@@ -209,12 +186,19 @@ def look_at_step(result: Any, space: Any, add: Add) -> bool:
         add("step values", f"step() returns {number_of(result)}: {five}")
         return True
     obs, reward, terminated, truncated, _ = result
-    look_at_observation(obs, space, add)
-    look_at_reward(reward, add)
-    for name, flag in (("terminated", terminated), ("truncated", truncated)):
-        if not isinstance(flag, (bool, np.bool_)):
-            add(name, f"{name} is {flag!r:.50}: return True or False")
+    look(obs)
+    usable("reward", reward, check_number, add)
+    usable("terminated", terminated, check_flag, add)
+    usable("truncated", truncated, check_flag, add)
     return bool(np.any(terminated) or np.any(truncated))
+
+
+def usable(name: str, value: Any, check: Callable[[str, Any], Any], add: Add) -> None:
+    """Checks a value as the run will."""
+    try:
+        check(name, value)
+    except Unusable as error:
+        add(error.name, f"{error}: {error.remedy}")
 
 
 def has_time_limit(env: gymnasium.Env) -> bool:
@@ -227,7 +211,9 @@ def has_time_limit(env: gymnasium.Env) -> bool:
     return getattr(env.spec, "max_episode_steps", None) is not None
 
 
-def begin(env: gymnasium.Env, seed: int, add: Add) -> gymnasium.Env | None:
+def begin(
+    env: gymnasium.Env, seed: int, look: Callable[[Any], None], add: Add
+) -> gymnasium.Env | None:
     """Resets and checks what is returned.
 
     Returns:
@@ -238,7 +224,7 @@ def begin(env: gymnasium.Env, seed: int, add: Add) -> gymnasium.Env | None:
         try:
             result: Any = env.reset(seed=seed)
         except TypeError as error:
-            if "seed" not in str(error):
+            if "unexpected keyword argument 'seed'" not in str(error):
                 raise
             remedy = "take seed=None, options=None and call super().reset(seed=seed)"
             add("seed", f"reset() does not accept seed=: {remedy}")
@@ -252,7 +238,7 @@ def begin(env: gymnasium.Env, seed: int, add: Add) -> gymnasium.Env | None:
     else:
         add("reset values", f"reset() returns {number_of(result)}: return obs, info (a dict)")
         result = result[0] if isinstance(result, tuple) and result else result
-    look_at_observation(result, env.observation_space, add)
+    look(result)
     return env
 
 
@@ -263,46 +249,46 @@ def number_of(result: Any) -> str:
     return f"one value, a {type(result).__name__}"
 
 
-def look_at_observation(obs: Any, space: Any, add: Add) -> None:
-    """Checks that an observation matches its space, is finite and within bounds."""
-    if not isinstance(space, spaces.Dict):
-        look_at_array("obs", obs, space, add)
+def look_at_observation(obs: Any, space: Any, reading: Reading, add: Add) -> None:
+    """Checks that the run can read an observation, and that it is of its space."""
+    try:
+        reading.check_containers(obs)
+    except Unusable as error:
+        add(f"{error.name} keys", f"{error}: {error.remedy}")
         return
-    if not isinstance(obs, Mapping):
-        add("obs", f"obs is a {type(obs).__name__}, but its space is a Dict: return a dict")
-        return
-    if set(obs) != set(space.spaces):
-        keys = f"obs has keys {sorted(map(str, obs))}, but its space {sorted(space.spaces)}"
-        add("obs keys", f"{keys}: return the keys of the space")
-    for key in space.spaces.keys() & obs.keys():
-        look_at_array(f"obs[{key!r}]", obs[key], space[key], add)
+    for entry in reading.entries:
+        look_at_entry(entry, find(obs, entry.path), find(space, entry.path), add)
 
 
-def look_at_array(name: str, obs: Any, box: Any, add: Add) -> None:
-    """Checks that an array matches its `Box`, is finite and within bounds.
+def look_at_entry(entry: Entry, obs: Any, space: Any, add: Add) -> None:
+    """Checks one entry: its type and dtype, that the run can read it, and its bounds."""
+    name = label("obs", entry.path)
+    if isinstance(space, (spaces.Box, spaces.MultiBinary, spaces.MultiDiscrete)):
+        if not hasattr(obs, "__array__"):
+            remedy = f"return a numpy array of {space.dtype}"
+            add(f"{name} type", f"{name} is a {type(obs).__name__}: {remedy}")
+            return
+        dtype = getattr(obs, "dtype", None)
+        if (
+            isinstance(space, spaces.Box)
+            and isinstance(dtype, np.dtype)
+            and dtype != space.dtype
+        ):
+            remedy = f"return .astype(np.{space.dtype}), or declare a Box of {dtype}"
+            add(f"{name} dtype", f"{name} is {dtype}, but its space {space.dtype}: {remedy}")
+            if space.dtype == np.uint8:  # said once: a picture must be of bytes
+                return
+    try:
+        entry.kind.convert(name, obs)
+    except Unusable as error:
+        add(f"{name} value", f"{error}: {error.remedy}")
+        return
+    if isinstance(space, spaces.Box):
+        look_at_bounds(name, np.asarray(obs, np.float64), space, add)
 
-    Skips other spaces, because `look_at_observation_space` reports them.
-    """
-    if not isinstance(box, spaces.Box):
-        return
-    if not isinstance(obs, (np.ndarray, np.generic)):
-        remedy = f"return a numpy array of {box.dtype}"
-        add(f"{name} type", f"{name} is a {type(obs).__name__}: {remedy}")
-        return
-    if obs.dtype != box.dtype:
-        remedy = f"return .astype(np.{box.dtype}), or declare a Box of {obs.dtype}"
-        add(f"{name} dtype", f"{name} is {obs.dtype}, but its space {box.dtype}: {remedy}")
-    if obs.shape != box.shape:
-        text = f"{name} has shape {obs.shape}, but its space {box.shape}"
-        add(f"{name} shape", f"{text}: change one of them")
-        return
-    if obs.dtype.kind not in "fiub":
-        return
-    value = np.asarray(obs, np.float64)
-    if not np.isfinite(value).all():
-        where, worst = first(~np.isfinite(value), value)
-        add(f"{name} finite", f"{name}{where} is {worst}: return finite numbers")
-        return
+
+def look_at_bounds(name: str, value: np.ndarray, box: spaces.Box, add: Add) -> None:
+    """Checks that numbers are within the bounds of their `Box`."""
     low, high = (np.asarray(bound, np.float64) for bound in (box.low, box.high))
     low = low - TOLERANCE * np.maximum(1, np.abs(low))
     high = high + TOLERANCE * np.maximum(1, np.abs(high))
@@ -312,25 +298,12 @@ def look_at_array(name: str, obs: Any, box: Any, add: Add) -> None:
         add(f"{name} bounds", f"{text}: declare wider bounds")
 
 
-def first(mask: np.ndarray, value: np.ndarray) -> tuple[str, float]:
-    """The first entry that is True in a mask: its index in brackets, and its value."""
-    where = np.argwhere(mask)[0].tolist()
-    return f"{where or ''}", float(value[tuple(where)])
-
-
-def look_at_reward(reward: Any, add: Add) -> None:
-    """Checks that the reward is a finite number."""
-    if np.ndim(reward):
-        add("reward", f"reward has shape {np.shape(reward)}: return a number")
-    elif not isinstance(np.asarray(reward)[()], (np.bool_, np.integer, np.floating)):
-        add("reward", f"reward is {reward!r:.50}: return a number")
-    elif not np.isfinite(reward):
-        add("reward", f"reward is {reward}: return a finite number")
-
-
-def refuse(name: str, found: list[str]) -> None:
+def refuse(name: str, found: list[Problem]) -> None:
     """Raises `InvalidInput` if an environment has problems."""
     if found:
         count = f"{len(found)} problem{'s' if len(found) > 1 else ''}"
-        listed = "; ".join(f"({i}) {text}" for i, text in enumerate(found, start=1))
-        raise InvalidInput("env", name, f"{count}: {listed}")
+        listed = "; ".join(f"({i}) {text}" for i, (text, _) in enumerate(found, start=1))
+        settings = {
+            name: value for problem in found for name, value in problem.settings.items()
+        }
+        raise InvalidInput("env", name, f"{count}: {listed}", settings)

@@ -50,6 +50,7 @@ class Pool:
       spec: what an agent has to know; mostly from the simulators.
       restarts: number of restarts after a failure so far.
       made: how the environments were made, if whoever makes the pool says so.
+      notices: what to say when a run starts; from the simulators.
     """
 
     made: Made | None = None
@@ -83,9 +84,11 @@ class Pool:
             a simulator.
 
         Raises:
-          InvalidInput: an impossible choice, or an `InvalidInput` that `make` raised.
+          InvalidInput: an impossible choice, a `make` that makes nothing or that workers
+            cannot import, or an `InvalidInput` that it raised.
           EnvironmentFailure: a simulator could not be made.
         """
+        check_maker(make, "a simulator")
         check_choices(num_envs, action_repeat, workers, timeout, on_failure)
         self.restarts = 0
         self._on_failure = on_failure
@@ -266,6 +269,7 @@ class Pool:
             if refused := troubles[env].refused:
                 raise InvalidInput(*refused)
             self._fail(env, troubles[env])
+        self.notices = described[0].notices
         for env, description in described.items():
             if description != described[0]:
                 differs = f"made {description}, but {described[0]} for environment 0"
@@ -275,7 +279,7 @@ class Pool:
             task=task,
             num_envs=len(described),
             action_repeat=action_repeat,
-            **described[0]._asdict(),
+            **described[0].of_spec(),
         )
 
     def _build(self, broken: Collection[int] = ()) -> None:
@@ -284,7 +288,7 @@ class Pool:
         factories = dict.fromkeys(sorted(envs), self._make)
         described, troubles = self._crew.build(factories, timeout=self._start_timeout)
         for env, said in described.items():
-            if any(getattr(self.spec, name) != value for name, value in said._asdict().items()):
+            if any(getattr(self.spec, name) != value for name, value in said.of_spec().items()):
                 reason = f"the simulator changed when it was made again: {said}"
                 troubles[env] = Trouble(reason, building=True)
         if troubles:
@@ -380,6 +384,19 @@ def arrays_of(timestep: TimeStep) -> list[tuple[str, np.ndarray]]:
     named = [(name, array) for name, _, array in leaves(timestep.obs)]
     named += zip(TimeStep._fields[1:], timestep[1:], strict=True)
     return [(name, np.asarray(array)) for name, array in named]
+
+
+def check_maker(make: Any, what: str) -> None:
+    """Refuses an object in the place of the function or class that makes it.
+
+    Raises:
+      InvalidInput: `make` cannot be called.
+    """
+    if callable(make):
+        return
+    name = type(make).__name__
+    remedy = f"is a {name}, not a function or class that makes {what}: use lambda: {name}(...)"
+    raise InvalidInput("make", make, remedy)
 
 
 def check_choices(

@@ -14,7 +14,7 @@ class Outcome(NamedTuple):
 
     Attributes:
       obs: as `Simulator.obs` specifies; the next step may reuse its arrays.
-      reward: sum over the action repeat.
+      reward: sum over the action repeat; a number, or an array of one without axes.
       is_last: the episode is over, for any reason; only `reset` may follow.
       is_terminal: the return ends here. Usually the last step of an episode, but a lost
         life may end the return without ending the episode.
@@ -37,6 +37,8 @@ class Simulator(Protocol):
       action_size: width of the action, or number of discrete actions.
       discrete: whether actions are choices.
       episode_length: steps of a full episode, None if it varies.
+
+    An attribute `notices`, if there is one, is a tuple of lines to say when a run starts.
     """
 
     obs: PyTree

@@ -23,13 +23,14 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from vawm.envs.host.channel import Channel, Fields, view
 from vawm.envs.host.simulator import Outcome, Simulator
+from vawm.envs.host.usable import Unusable, check_array, check_flag, check_number, one_line
 from vawm.errors import InvalidInput
 from vawm.process import streams
 from vawm.types import ArraySpec, PyTree
@@ -39,8 +40,6 @@ WATCH_SECONDS = 1.0
 """Interval at which to check that the pool's process lives, if the kernel does not tell."""
 TELL = signal.SIGUSR1  # asks a hanging worker for its traceback
 PR_SET_PDEATHSIG = 1  # linux/prctl.h
-LARGEST = float(np.finfo(np.float32).max)
-LONGEST = 300  # characters of an exception's message
 
 
 class Description(NamedTuple):
@@ -50,6 +49,11 @@ class Description(NamedTuple):
     action_size: int
     discrete: bool
     episode_length: int | None
+    notices: tuple[str, ...] = ()
+
+    def of_spec(self) -> dict[str, Any]:
+        """Those that are fields of an `EnvSpec`."""
+        return {name: value for name, value in self._asdict().items() if name != "notices"}
 
 
 class Trouble(NamedTuple):
@@ -60,14 +64,14 @@ class Trouble(NamedTuple):
       traceback: of the worker, or "".
       building: whether the simulator could not be made.
       guilty: False if another environment took the worker down.
-      refused: field, value and remedy, if making it raised `InvalidInput`.
+      refused: field, value, remedy and settings, if making it raised `InvalidInput`.
     """
 
     reason: str
     traceback: str = ""
     building: bool = False
     guilty: bool = True
-    refused: tuple[str, Any, str] | None = None
+    refused: tuple[str, Any, str, Mapping[str, Any]] | None = None
 
 
 class Answer(NamedTuple):
@@ -76,10 +80,6 @@ class Answer(NamedTuple):
     ticket: int
     results: dict[int, Any]
     troubles: dict[int, Trouble]
-
-
-class Unusable(ValueError):
-    """A simulator returned a value that no agent can use; the message names it."""
 
 
 class NotBuilt(Exception):
@@ -149,7 +149,7 @@ class Worker:
     def build(self, env: int, factory: bytes) -> Description:
         """Makes the simulator, from its own copy of the factory."""
         try:
-            simulator = pickle.loads(factory)()
+            simulator = unpickled(factory)()
             self.description = describe_simulator(simulator)
         except BaseException as error:
             raise NotBuilt from error
@@ -178,8 +178,8 @@ class Worker:
             if count == len(actions):
                 self.write(env, outcome)
             elif outcome.is_last:
-                ended = f"the replayed episode ended after {count} of {len(actions)} steps"
-                raise Unusable(ended)
+                ended = f"ended after {count} of {len(actions)} steps"
+                raise Unusable("the replayed episode", ended)
 
     def close(self, env: int, _: None = None) -> None:
         """Closes the simulator and ignores its errors."""
@@ -208,19 +208,17 @@ class Worker:
 
     def write(self, env: int, outcome: Outcome) -> None:
         """Writes an outcome to shared memory, after checking all of it."""
-        reward = check_reward(outcome.reward)
-        for name in ("is_last", "is_terminal"):
-            flag = getattr(outcome, name)
-            if not isinstance(flag, (bool, np.bool_)):
-                raise Unusable(f"{name} is {flag!r:.100}, not True or False")
+        reward = check_number("reward", outcome.reward)
+        is_last = check_flag("is_last", outcome.is_last)
+        is_terminal = check_flag("is_terminal", outcome.is_terminal)
         values = [self.entry(outcome.obs, key) for _, key, *_ in self.obs]
         for (name, _, spec, _), value in zip(self.obs, values, strict=True):
             check_array(name, value, spec)
         for (*_, memory), value in zip(self.obs, values, strict=True):
             memory[env] = value
         self.arrays["reward"][env] = reward
-        self.arrays["is_last"][env] = outcome.is_last
-        self.arrays["is_terminal"][env] = outcome.is_terminal
+        self.arrays["is_last"][env] = is_last
+        self.arrays["is_terminal"][env] = is_terminal
 
     def entry(self, obs: PyTree, key: Any) -> Any:
         """`obs`, or its entry `key` if observations are dicts."""
@@ -228,8 +226,25 @@ class Worker:
             return obs
         if not isinstance(obs, Mapping) or len(obs) != len(self.obs) or key not in obs:
             kind = f"of {sorted(map(str, obs))}" if isinstance(obs, Mapping) else type(obs)
-            raise Unusable(f"obs is {kind}, not a dict of {[key for _, key, *_ in self.obs]}")
+            keys = [key for _, key, *_ in self.obs]
+            raise Unusable("obs", f"is {kind}, not a dict of {keys}")
         return obs[key]
+
+
+def unpickled(factory: bytes) -> Callable[[], Simulator]:
+    """The factory from its pickle, which names modules rather than containing them.
+
+    Raises:
+      InvalidInput: a module, or what it should contain, is not found in this process.
+    """
+    try:
+        return pickle.loads(factory)
+    except (ImportError, AttributeError) as error:
+        remedy = (
+            f"is not found in the processes of the environments ({one_line(error)}): define it "
+            "in the script itself, or in a module whose folder is in PYTHONPATH"
+        )
+        raise InvalidInput("make", error.name or "the environment", remedy) from error
 
 
 def describe_simulator(simulator: Simulator) -> Description:
@@ -238,52 +253,28 @@ def describe_simulator(simulator: Simulator) -> Description:
     Raises:
       TypeError: names an attribute that does not follow `Simulator`.
     """
-    said = Description(*(getattr(simulator, name) for name in Description._fields))
+    said = Description(
+        simulator.obs,
+        simulator.action_size,
+        simulator.discrete,
+        simulator.episode_length,
+        notices=tuple(getattr(simulator, "notices", ())),
+    )
     for name, key, spec in leaves(said.obs):
         if not isinstance(spec, ArraySpec) or not isinstance(key, (str, type(None))):
             raise TypeError(f"{name} of the simulator is {spec!r:.100}, not an ArraySpec")
-    for name, value in (("action_size", said.action_size), ("episode_length", said[-1])):
+    for name, value in (
+        ("action_size", said.action_size),
+        ("episode_length", said.episode_length),
+    ):
         may_be_none = name == "episode_length" and value is None
         if not may_be_none and not (isinstance(value, (int, np.integer)) and value >= 1):
             raise TypeError(f"{name} of the simulator is {value!r:.100}, not 1 or more")
-    return Description(
-        obs=said.obs,
+    return said._replace(
         action_size=int(said.action_size),
         discrete=bool(said.discrete),
         episode_length=None if said.episode_length is None else int(said.episode_length),
     )
-
-
-def check_reward(reward: Any) -> float:
-    """Checks that a reward is a number in the range of float32.
-
-    Raises:
-      Unusable: names the wrong value.
-    """
-    if isinstance(reward, np.ndarray) and reward.ndim == 0:
-        reward = reward[()]
-    if not isinstance(reward, (int, float, np.floating, np.integer, np.bool_)):
-        raise Unusable(f"reward is {reward!r:.100}, not a number")
-    if not abs(number := float(reward)) <= LARGEST:
-        raise Unusable(f"reward is {number}, not a finite float32")
-    return number
-
-
-def check_array(name: str, value: Any, spec: ArraySpec) -> None:
-    """Checks that an array follows its spec and is finite.
-
-    Raises:
-      Unusable: names the wrong type, dtype, shape or value.
-    """
-    if not isinstance(value, np.ndarray):
-        raise Unusable(f"{name} is a {type(value).__name__}, not a numpy array")
-    if value.dtype != spec.dtype or value.shape != spec.shape:
-        raise Unusable(
-            f"{name} is {value.dtype}{list(value.shape)}, not {spec.dtype}{list(spec.shape)}"
-        )
-    if value.dtype.kind == "f" and not (finite := np.isfinite(value)).all():
-        where = np.argwhere(~finite)[0].tolist()
-        raise Unusable(f"{name}{where or ''} is {value[tuple(where)]}, not finite")
 
 
 def describe(error: BaseException) -> Trouble:
@@ -293,19 +284,13 @@ def describe(error: BaseException) -> Trouble:
     reason = str(cause) if isinstance(cause, Unusable) else f"raised {one_line(cause)}"
     refused = None
     if building and isinstance(cause, InvalidInput):
-        refused = cause.field, sendable(cause.value), cause.remedy
+        refused = cause.field, sendable(cause.value), cause.remedy, cause.settings
     return Trouble(
         reason=f"could not be made: {reason}" if building else reason,
         traceback="".join(traceback.format_exception(cause)),
         building=building,
         refused=refused,
     )
-
-
-def one_line(error: BaseException) -> str:
-    """Name and message of an exception, in one line."""
-    message = " ".join("".join(traceback.format_exception_only(error)).split())
-    return message if len(message) <= LONGEST else f"{message[:LONGEST]}..."
 
 
 def sendable(value: Any) -> Any:

@@ -8,10 +8,10 @@ from vawm.config import AtariConfig, Config
 from vawm.envs.host import atari
 from vawm.envs.host.frames import check_smaller
 from vawm.envs.host.pool import Pool
+from vawm.envs.protocol import check_image_size
 from vawm.errors import BELOW_ONE, NOT_NEGATIVE, InvalidInput
 from vawm.runs.suites import on_host
 from vawm.runs.suites.record import Protocol, Suite
-from vawm.world_model.codecs import check_image_size
 
 
 def check(config: Config, env: AtariConfig) -> None:

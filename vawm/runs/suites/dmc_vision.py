@@ -7,10 +7,10 @@ import functools
 from vawm.config import Config, VisionConfig
 from vawm.envs.host import rendering, vision
 from vawm.envs.host.pool import Pool
+from vawm.envs.protocol import check_image_size
 from vawm.errors import Rule
 from vawm.runs.suites import dmc_proprio, on_host
 from vawm.runs.suites.record import Protocol, Suite
-from vawm.world_model.codecs import check_image_size
 
 CAMERA: Rule = (lambda x: x >= -1, "use the number of a camera, or -1 for the usual one")
 RENDERER_BYTES = 70 * 2**20

@@ -7,12 +7,13 @@ from typing import Any
 from vawm.config import Config, GymnasiumConfig
 from vawm.envs.host import gymnasium
 from vawm.envs.host.pool import Pool
-from vawm.errors import NOT_NEGATIVE, InvalidInput
+from vawm.envs.protocol import check_image_size
+from vawm.errors import NOT_NEGATIVE, InvalidInput, within
 from vawm.runs.suites.record import Protocol, Suite
 
 
 def check(config: Config, env: GymnasiumConfig) -> None:
-    """Refuses to repeat actions.
+    """Refuses to repeat actions, and impossible images.
 
     Raises:
       InvalidInput: names the field and the remedy.
@@ -20,6 +21,7 @@ def check(config: Config, env: GymnasiumConfig) -> None:
     if config.action_repeat != 1:
         remedy = "use 1: a Gymnasium environment repeats actions itself, or not at all"
         raise InvalidInput("action_repeat", config.action_repeat, remedy)
+    check_image_size("env.image_size", env.image_size)
 
 
 def make(config: Config, env: GymnasiumConfig, **of_env: Any) -> Pool:
@@ -33,15 +35,19 @@ def make(config: Config, env: GymnasiumConfig, **of_env: Any) -> Pool:
     Raises:
       InvalidInput: also for all that does not fit in the environment, at once.
     """
-    return gymnasium.from_gymnasium(
-        config.task,
-        num_envs=config.num_envs,
-        time_limit=env.time_limit or None,
-        workers=env.workers,
-        timeout=env.timeout,
-        on_failure=env.on_failure,
-        **of_env,
-    )
+    try:
+        return gymnasium.from_gymnasium(
+            config.task,
+            num_envs=config.num_envs,
+            time_limit=env.time_limit or None,
+            workers=env.workers,
+            timeout=env.timeout,
+            on_failure=env.on_failure,
+            image_size=env.image_size,
+            **of_env,
+        )
+    except InvalidInput as error:
+        raise within("env", error) from error
 
 
 SUITE = Suite(
