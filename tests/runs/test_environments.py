@@ -47,7 +47,8 @@ def test_a_registered_id_is_made_again_with_its_arguments():
     given = {"sutton_barto_reward": True}
     with vawm.envs.from_gymnasium("CartPole-v1", task="mine", time_limit=5, **given) as env:
         spec = spec_of(env)
-    assert spec.made == Made("gymnasium", "CartPole-v1", {"time_limit": 5}, given)
+    options = {"time_limit": 5, "image_size": 64}
+    assert spec.made == Made("gymnasium", "CartPole-v1", options, given)
     with evaluate.environments(policy_of(spec), episodes=1) as env:
         assert spec_of(env) == spec
         assert steps_of_episode(env) == 5
