@@ -375,7 +375,7 @@ def notice_of(kind: Kind, space: Any) -> str:
 
 
 def label(root: str, path: Path) -> str:
-    """A name for messages, such as "obs['robot'][0]"."""
+    """A name for messages, such as `obs['robot'][0]`."""
     return root + "".join(f"[{key!r}]" for key in path)
 
 
