@@ -11,6 +11,7 @@ import pytest
 import tiny
 
 from vawm import presets
+from vawm.agent import make_agent
 from vawm.learning import host_train
 from vawm.runs import trainer
 from vawm.runs.runner import RunError
@@ -164,7 +165,9 @@ def test_metrics_that_are_not_kept_are_not_computed(monkeypatch):
 
     monkeypatch.setattr(trainer.train, "make_train_step", lambda *_: two)
     monkeypatch.setattr(trainer.train, "init", lambda *_: jnp.zeros(()))
-    made = trainer.on_device(tiny.env(), None, tiny.CONFIG, lambda name: name == "kept")
+    env = tiny.env()
+    agent = make_agent(tiny.CONFIG, env.spec)
+    made = trainer.on_device(env, agent, tiny.CONFIG, lambda name: name == "kept")
     _, metrics = made.compile(jnp.zeros(())).run(jnp.zeros(()))
     assert list(metrics) == ["kept"]
 
