@@ -216,6 +216,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     policy = load(arguments.logdir)
     suite, task = policy.config.suite, policy.spec.task
     variants = _variants(arguments, suite)
+    suites.check_made(policy.spec.made, python=in_python(arguments.episodes or 1))
     print(f"{task} ({suite}) at {policy.env_steps} env steps, mean +- standard error")
     for name, options in variants.items():
         score = by_protocol(

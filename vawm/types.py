@@ -56,7 +56,8 @@ class Made(NamedTuple):
       options: what was chosen beside it, such as a time limit; values that JSON has.
       kwargs: keyword arguments of the environment itself; values that JSON has.
       opaque: other keyword arguments -> their `repr`. They cannot be made again.
-      wrappers: those that a registered id comes with, the innermost first.
+      registered: what a registered id stood for: its entry point, keyword arguments and
+        wrappers.
     """
 
     by: str
@@ -64,7 +65,7 @@ class Made(NamedTuple):
     options: dict[str, Any] = {}  # noqa: RUF012 - never mutated
     kwargs: dict[str, Any] = {}  # noqa: RUF012
     opaque: dict[str, str] = {}  # noqa: RUF012
-    wrappers: tuple[str, ...] = ()
+    registered: dict[str, Any] = {}  # noqa: RUF012
 
 
 class EnvSpec(NamedTuple):

@@ -1,13 +1,16 @@
 """The environments of a run: what it keeps of them, and that commands make the same again."""
 
+import copy
 import dataclasses
 import functools
 import json
 
+import gymnasium
 import numpy as np
 import pytest
 import tiny
 import toy
+from gymnasium.envs.registration import WrapperSpec
 from refusals import refused
 from runs import save_toy
 
@@ -48,10 +51,82 @@ def test_a_registered_id_is_made_again_with_its_arguments():
     with vawm.envs.from_gymnasium("CartPole-v1", task="mine", time_limit=5, **given) as env:
         spec = spec_of(env)
     options = {"time_limit": 5, "image_size": 64}
-    assert spec.made == Made("gymnasium", "CartPole-v1", options, given)
+    record = Made("gymnasium", "CartPole-v1", options, given)
+    assert spec.made._replace(registered={}) == record
+    assert spec.made.registered["entry_point"].endswith("CartPoleEnv")
     with evaluate.environments(policy_of(spec), episodes=1) as env:
         assert spec_of(env) == spec
         assert steps_of_episode(env) == 5
+
+
+def record_of(name, **choices):
+    """The record of an id, whose time limit is that of its registration unless given."""
+    with vawm.envs.from_gymnasium(name, check=False, **choices) as env:
+        return made.of(env)
+
+
+@pytest.fixture
+def cartpole():
+    """The registration of an id, as it is in this process; restored after the test."""
+    name, usual = "CartPole-v1", gymnasium.registry["CartPole-v1"]
+    gymnasium.registry[name] = copy.deepcopy(usual)
+    yield gymnasium.registry[name]
+    gymnasium.registry[name] = usual
+
+
+def test_a_time_limit_that_a_script_registered_is_kept(cartpole):
+    cartpole.max_episode_steps = 4
+    spec = toy.SPEC._replace(task="CartPole-v1", made=record_of("CartPole-v1"))
+    cartpole.max_episode_steps = 500
+    with evaluate.environments(policy_of(spec), episodes=1) as env:
+        assert steps_of_episode(env) == 4
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("entry_point", "gymnasium.envs.classic_control:AcrobotEnv"),
+        ("kwargs", {"sutton_barto_reward": True}),
+        ("additional_wrappers", (WrapperSpec("TL", "a:TimeLimit", {"max_episode_steps": 4}),)),
+    ],
+)
+def test_an_id_that_stands_for_something_else_now_is_refused(cartpole, name, value):
+    record = record_of("CartPole-v1")
+    suites.check_made(record, python="TWO LINES")
+    setattr(cartpole, name, value)
+    with refused("env", "CartPole-v1", naming=name.removeprefix("additional_")):
+        suites.check_made(record, python="TWO LINES")
+
+
+def test_a_run_without_a_time_limit_is_not_cut_short_later(cartpole):
+    cartpole.max_episode_steps = None
+    record = record_of("CartPole-v1")
+    suites.check_made(record, python="TWO LINES")
+    cartpole.max_episode_steps = 500
+    with refused("env", "CartPole-v1", naming=("time_limit", "500", "TWO LINES")):
+        suites.check_made(record, python="TWO LINES")
+
+
+def test_an_id_that_is_not_registered_here_needs_its_plugin(cartpole):
+    gymnasium.registry["Local-v0"] = cartpole
+    try:
+        record = record_of("Local-v0")
+    finally:
+        del gymnasium.registry["Local-v0"]
+    with refused("env", "Local-v0", naming=("--plugin", "TWO LINES")):
+        suites.check_made(record, python="TWO LINES")
+
+
+def test_arguments_of_an_environment_may_have_any_name(monkeypatch):
+    given = {"config": {"a": 1}, "env": "x"}
+    record = Made("gymnasium", "CartPole-v1", {"time_limit": 5}, given)
+    record = record._replace(registered=record_of("CartPole-v1").registered)
+    calls = []
+    simulators = suites.gymnasium.gymnasium
+    monkeypatch.setattr(simulators, "from_gymnasium", lambda *_, **made: calls.append(made))
+    suites.make_again(HOST, record, task="mine", python="")
+    assert {name: calls[0][name] for name in given} == given
+    assert (calls[0]["task"], calls[0]["time_limit"]) == ("mine", 5)
 
 
 def test_a_run_of_an_earlier_version_is_in_the_environment_of_its_config():
@@ -70,7 +145,8 @@ class Box(dict):
     [(GridWorld, {}), (functools.partial(GridWorld), {}), ("CartPole-v1", {"x": Box()})],
 )
 def test_what_the_caller_made_is_refused_and_named(make, kwargs):
-    record = made.by_gymnasium(make, options={"time_limit": 7}, kwargs=kwargs)
+    options = {"time_limit": 7}
+    record = made.by_gymnasium(make, options=options, kwargs=kwargs, registered={})
     policy = policy_of(toy.SPEC._replace(made=record))
     lines = ("vawm.load(LOGDIR)", "vawm.evaluate.evaluate(policy, episodes=2, env=...)")
     with refused("env", made.describe(record), naming=lines):
@@ -114,7 +190,7 @@ def test_choices_of_a_suite_are_made_again():
 
 
 def test_the_record_survives_json_and_the_checkpoint(tmp_path):
-    record = Made("gymnasium", "A-v0", {"time_limit": 5}, {"x": [1]}, {"f": "<f>"}, ("W",))
+    record = Made("gymnasium", "A-v0", {"time_limit": 5}, {"x": [1]}, {"f": "<f>"}, {"W": []})
     assert made.from_dict(json.loads(json.dumps(made.as_dict(record)))) == record
     save_toy(tmp_path, toy.state(), spec=toy.SPEC._replace(made=record))
     assert resume.saved_made(tmp_path) == record
@@ -129,7 +205,7 @@ def test_a_run_without_a_checkpoint_keeps_the_record_in_its_config(tmp_path):
 
 
 SPEC = toy.SPEC._replace(
-    made=Made("gymnasium", "A-v0", {"time_limit": 5}, {"x": 1}, wrappers=("W",))
+    made=Made("gymnasium", "A-v0", {"time_limit": 5}, {"x": 1}, registered={"wrappers": ["W"]})
 )
 
 
@@ -141,7 +217,7 @@ SPEC = toy.SPEC._replace(
         ("time_limit", {"options": {"time_limit": None}}),
         ("x", {"kwargs": {"x": 2}}),
         ("x", {"kwargs": {}}),
-        ("wrappers", {"wrappers": ()}),
+        ("wrappers", {"registered": {}}),
     ],
 )
 def test_another_environment_is_refused_on_resume(tmp_path, name, change):
@@ -175,7 +251,9 @@ def test_a_run_of_an_earlier_version_is_resumed_in_any_environment_of_its_spec(t
 
 
 def test_the_repr_of_an_argument_has_no_address():
-    record = made.by_gymnasium("A-v0", options={}, kwargs={"f": tiny.env, "x": 1})
+    record = made.by_gymnasium(
+        "A-v0", options={}, kwargs={"f": tiny.env, "x": 1}, registered={}
+    )
     assert record.kwargs == {"x": 1}
     assert record.opaque == {"f": "<function env>"}
 

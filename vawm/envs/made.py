@@ -38,7 +38,7 @@ def by_gymnasium(
     *,
     options: Mapping[str, Any],
     kwargs: Mapping[str, Any],
-    wrappers: tuple[str, ...] = (),
+    registered: Mapping[str, Any],
 ) -> Made:
     """The record of `vawm.envs.from_gymnasium`.
 
@@ -46,7 +46,7 @@ def by_gymnasium(
       make: the registered id, or the caller's function or class.
       options: what `from_gymnasium` was given beside it, and what changes the environment.
       kwargs: for the environment.
-      wrappers: that the id is registered with.
+      registered: what the id stands for, see `vawm.envs.host.gymnasium.registration`.
     """
     plain = {name: value for name, value in kwargs.items() if in_json(value)}
     return Made(
@@ -55,7 +55,7 @@ def by_gymnasium(
         options=dict(options),
         kwargs=plain,
         opaque={name: shown(kwargs[name]) for name in kwargs.keys() - plain.keys()},
-        wrappers=wrappers,
+        registered=dict(registered),
     )
 
 
@@ -97,7 +97,7 @@ def differences(then: EnvSpec, now: EnvSpec) -> Iterator[Difference]:
             yield Difference(name, getattr(then, name), getattr(now, name))
     if then.made is None or now.made is None:
         return
-    for name in ("by", "name", "wrappers"):
+    for name in ("by", "name"):
         values = getattr(then.made, name), getattr(now.made, name)
         if values[0] != values[1]:
             objects = then.made.by == now.made.by == OBJECT
@@ -105,6 +105,7 @@ def differences(then: EnvSpec, now: EnvSpec) -> Iterator[Difference]:
     for own, others, grave in (
         (then.made.options, now.made.options, True),
         (then.made.kwargs, now.made.kwargs, True),
+        (then.made.registered, now.made.registered, True),
         (then.made.opaque, now.made.opaque, False),
     ):
         for name in sorted(own.keys() | others.keys()):
@@ -114,19 +115,19 @@ def differences(then: EnvSpec, now: EnvSpec) -> Iterator[Difference]:
 
 def as_dict(made: Made) -> dict[str, Any]:
     """Converts `made` for JSON."""
-    return made._asdict() | {"wrappers": list(made.wrappers)}
+    return made._asdict()
 
 
 def from_dict(content: Any) -> Made:
     """The inverse of `as_dict`; ValueError for other content."""
     kinds = {"by": str, "name": str, "options": dict, "kwargs": dict, "opaque": dict}
-    kinds["wrappers"] = list
+    kinds["registered"] = dict
     if not isinstance(content, dict) or content.keys() != kinds.keys():
         raise ValueError(f"{str(content)[:40]!r} does not say how environments were made")
     for name, kind in kinds.items():
         if not isinstance(content[name], kind):
             raise ValueError(f"{name} is {str(content[name])[:40]!r}, of the wrong type")
-    return Made(**content | {"wrappers": tuple(map(str, content["wrappers"]))})
+    return Made(**content)
 
 
 def qualified(thing: Any) -> str:

@@ -34,7 +34,7 @@ from vawm.envs.host.simulator import Outcome, Simulator
 from vawm.envs.host.usable import check_flag, one_line
 from vawm.envs.protocol import check_image_size, check_positive
 from vawm.errors import InvalidInput, suggestion
-from vawm.types import PyTree
+from vawm.types import Made, PyTree
 
 PACKAGES = {
     r"ALE/.+": "ale_py",
@@ -156,20 +156,54 @@ def from_gymnasium(
         if check
         else None,
     )
+    registered = source if isinstance(source, RegisteredEnv) else None
+    if time_limit is None and registered is not None:
+        time_limit = registered.max_episode_steps
     pool.made = made.by_gymnasium(
         make,
         options={"time_limit": time_limit, "image_size": image_size},
         kwargs=kwargs,
-        wrappers=wrappers_of(source),
+        registered={} if registered is None else registration(registered),
     )
     return pool
 
 
-def wrappers_of(source: RegisteredEnv | Callable[..., Any]) -> tuple[str, ...]:
-    """Names of the wrappers that an id is registered with."""
-    if not isinstance(source, RegisteredEnv):
-        return ()
-    return tuple(wrapper.name for wrapper in source.additional_wrappers)
+def registration(registered: RegisteredEnv) -> dict[str, Any]:
+    """What an id stands for but for its time limit, which a run keeps as its own."""
+    entry, wrappers = registered.entry_point, registered.additional_wrappers
+    return {
+        "entry_point": entry if isinstance(entry, str | None) else made.qualified(entry),
+        "kwargs": made.shown(registered.kwargs),
+        "wrappers": [f"{w.entry_point}({made.shown(w.kwargs or {})})" for w in wrappers],
+    }
+
+
+def check_registration(record: Made, *, python: str) -> None:
+    """Refuses an id that is not registered here, or stands for something else now.
+
+    Args:
+      record: how the environments of a run were made.
+      python: two statements that do with environments of the caller's what a command cannot.
+
+    Raises:
+      InvalidInput: names the difference.
+    """
+    try:
+        found = check_id(record.name)
+    except InvalidInput as error:
+        remedy = (
+            "is not registered in this process; name what registers it, with --plugin "
+            f"FILE_OR_MODULE; or in Python: {python}"
+        )
+        raise InvalidInput("env", record.name, remedy) from error
+    now = registration(found)
+    if record.options.get("time_limit") is None:  # nothing replaces that of the registration
+        now["time_limit"] = found.max_episode_steps
+    for name, value in now.items():
+        then = record.registered.get(name)
+        if value != then:
+            remedy = f"is registered with {name} {value!r} here, the run had {then!r}"
+            raise InvalidInput("env", record.name, f"{remedy}; in Python: {python}")
 
 
 def check_source(make: Any) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 
 from vawm.config import Config, GymnasiumConfig, HostEnvConfig
 from vawm.envs import made as records
+from vawm.envs.host.gymnasium import check_registration
 from vawm.envs.protocol import Environment, HostEnvironment
 from vawm.errors import InvalidInput
 from vawm.runs.suites import atari100k, dmc_proprio, dmc_vision, gymnasium
@@ -78,14 +79,20 @@ def _recorded(
 
 
 def check_made(made: Made | None, *, python: str) -> None:
-    """Refuses environments that were made by code of the caller's.
+    """Refuses environments that no command can make again as they were.
 
     Raises:
-      InvalidInput: the remedy names `python`, two statements that use such environments.
+      InvalidInput: they were made by code of the caller's, or by an id that stands for
+        something else here. The remedy names `python`, two statements that use environments
+        of the caller's.
     """
-    if made is not None and not records.can_be_made_again(made):
+    if made is None:
+        return
+    if not records.can_be_made_again(made):
         remedy = f"no command can make it again; in Python: {python}"
         raise InvalidInput("env", records.describe(made), remedy)
+    if made.by == "gymnasium":
+        check_registration(made, python=python)
 
 
 def make_again(
@@ -130,7 +137,7 @@ def make_again(
         env=choices,
     )
     if suite.choices is GymnasiumConfig:
-        return gymnasium.make(config, choices, task=task, **made.kwargs)  # type: ignore[arg-type]
+        return gymnasium.make(config, choices, task=task, kwargs=made.kwargs)  # type: ignore[arg-type]
     return make(config)
 
 

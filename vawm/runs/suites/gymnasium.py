@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from vawm.config import Config, GymnasiumConfig
@@ -24,13 +25,20 @@ def check(config: Config, env: GymnasiumConfig) -> None:
     check_image_size("env.image_size", env.image_size)
 
 
-def make(config: Config, env: GymnasiumConfig, **of_env: Any) -> Pool:
+def make(
+    config: Config,
+    env: GymnasiumConfig,
+    *,
+    task: str | None = None,
+    kwargs: Mapping[str, Any] | None = None,
+) -> Pool:
     """The environments of a run, in processes of their own.
 
     Args:
       config: of the run.
       env: its choices of the environments.
-      **of_env: further keyword arguments of `from_gymnasium`.
+      task: name of the task; that of the id if None.
+      kwargs: for the environment itself.
 
     Raises:
       InvalidInput: also for all that does not fit in the environment, at once.
@@ -44,7 +52,8 @@ def make(config: Config, env: GymnasiumConfig, **of_env: Any) -> Pool:
             timeout=env.timeout,
             on_failure=env.on_failure,
             image_size=env.image_size,
-            **of_env,
+            task=task,
+            **kwargs or {},
         )
     except InvalidInput as error:
         raise within("env", error) from error
