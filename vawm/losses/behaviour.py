@@ -51,7 +51,8 @@ def actor_loss(
         L = -(sg(A) * log pi(a | s) + entropy_scale * H[pi(. | s)])
 
     Args:
-      log_prob: `[...]` of the imagined action in nats, summed over action dims.
+      log_prob: `[...]` of the imagined action in nats, summed over action dims; finite, as that
+        of an action that the policy has sampled.
       entropy: `[...]` of the policy at the same state in nats, summed over action dims.
       advantage: `[...]` A = (R_t - v_t) / S, unitless; S is the scale of Eq. 9.
       entropy_scale: weight of the bonus.
