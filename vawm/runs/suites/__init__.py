@@ -145,7 +145,8 @@ def make_one(
         return gymnasium.make_one(config, config.env, **of_env | rendered)
     drawn = isinstance(config.env, HostEnvConfig) and of(config).has_images
     if render_mode not in (known := (None, "rgb_array") if drawn else (None,)):
-        raise InvalidInput("render_mode", render_mode, f"use {' or '.join(map(str, known))}")
+        remedy = f"environments of {config.suite} are not drawn like this; use "
+        raise InvalidInput("render_mode", render_mode, remedy + " or ".join(map(str, known)))
     if isinstance(config.env, HostEnvConfig):
         on_host = dataclasses.replace(config.env, on_failure="raise")
         config = dataclasses.replace(config, env=on_host)
