@@ -17,16 +17,19 @@ import numpy as np
 import pytest
 import safetensors.numpy
 import tiny
+import tiny_pixels
 import toy
+from analysis_records import make_policy
 from refusals import refused
 
 import vawm
 from vawm import evaluate, export
 from vawm.agent import make_agent
 from vawm.config import GymnasiumConfig
+from vawm.envs import made as records
 from vawm.envs.protocol import Environment
 from vawm.learning import train
-from vawm.policy import policy, weights
+from vawm.policy import hub, policy, weights
 from vawm.policy.play import Score
 from vawm.runs import checkpoint, suites
 from vawm.runs.checkpoint import SaveError, manifest
@@ -142,7 +145,7 @@ def test_the_documented_lines_act_in_a_process_that_never_trained(tmp_path, task
     if not changes:
         blocks.append(lines_of(export.__doc__.partition("--episodes 10")[2]))
         assert len(blocks[-1].splitlines()) == 5
-    check = "assert action.shape[1] == policy.spec.action_size\n"
+    check = "assert action in env.action_space\n"
     subprocess.run(
         [sys.executable, "-c", "".join(f"{block}\n{check}" for block in blocks)],
         env=os.environ | {"PYTHONPATH": str(pathlib.Path(vawm.__file__).parents[1])},
@@ -158,8 +161,8 @@ def test_the_card_of_a_users_environment_does_not_make_it(exported, task):
     loaded = vawm.load(exported)
     config = dataclasses.replace(loaded.config, task=task)
     card = export.card(loaded._replace(config=config), "")
-    assert "policy.act(" in card
-    assert "make(" not in card
+    assert "policy.predict(" in card
+    assert "make_env(" not in card
 
 
 def test_a_policy_of_another_version_is_loaded_with_a_warning(exported, monkeypatch, caplog):
@@ -243,6 +246,78 @@ def changed(**changes):
 def test_the_card_says_what_value_alignment_was(exported, config, expected):
     text = export.card(vawm.load(exported)._replace(config=config), "")
     assert f"| value alignment | {expected} |" in text
+
+
+# For hubs
+
+
+def front_matter(folder):
+    """The head of a card, by a reader of YAML."""
+    yaml = pytest.importorskip("yaml")
+    return yaml.safe_load((folder / weights.CARD).read_text().split("---\n")[1])
+
+
+def test_a_hub_finds_the_score_in_the_card_and_in_the_results(logdir, tmp_path):
+    folder = export.export(
+        logdir, tmp_path / "policy", scores=Score((1.0, 3.0)), layout="hub", replay=b"film"
+    )
+    head = front_matter(folder)
+    assert (head["library_name"], head["license"]) == ("vawm", "apache-2.0")
+    assert head["pipeline_tag"] == "reinforcement-learning"
+    assert {"reinforcement-learning", "dreamerv3", tiny.CONFIG.task} <= set(head["tags"])
+    [result] = head["model-index"][0]["results"]
+    assert result["task"]["type"] == "reinforcement-learning"
+    assert result["dataset"] == {"name": tiny.CONFIG.task, "type": tiny.CONFIG.task}
+    expected = {"type": "mean_reward", "value": "2.00 +/- 1.00", "verified": False}
+    assert expected.items() <= result["metrics"][0].items()
+    results = json.loads((folder / hub.RESULTS).read_text())
+    assert (results["mean_reward"], results["std_reward"]) == (2.0, 1.0)
+    assert results["n_eval_episodes"] == 2
+    assert results["last_training_return"] == {"mean": 0.25, "episodes": 3, "env_steps": 16}
+    assert (folder / hub.REPLAY).read_bytes() == b"film"
+
+
+def test_a_hub_folder_is_loaded_even_through_links(logdir, tmp_path):
+    """As the cache of a hub has them: every file is a link."""
+    folder = export.export(logdir, tmp_path / "policy", layout="hub")
+    assert "model-index" not in front_matter(folder)
+    linked = tmp_path / "snapshot"
+    linked.mkdir()
+    for path in folder.iterdir():
+        (linked / path.name).symlink_to(path)
+    trained, loaded = policy.load(logdir), vawm.load(linked)
+    toy.assert_equal(loaded.params, trained.params)
+    assert loaded.last_return == trained.last_return == (0.25, 3, 16)
+
+
+@pytest.mark.parametrize("damage", [{"mean": "x"}, {"episodes": -1}, {"more": 1}])
+def test_a_damaged_return_is_refused(copy, damage):
+    content = json.loads((copy / weights.CONFIG).read_text())
+    content["last_return"] |= damage
+    (copy / weights.CONFIG).write_text(json.dumps(content))
+    with refused("weights", str(copy / weights.CONFIG)):
+        vawm.load(copy)
+
+
+def test_the_program_says_why_there_is_no_film(logdir, tmp_path, capsys):
+    argv = ["--logdir", str(logdir), "--output", str(tmp_path / "policy")]
+    assert export.main([*argv, "--format", "hub", "--episodes", "0"]) == 0
+    assert f"without {hub.REPLAY}: " in capsys.readouterr().out
+    names = sorted(path.name for path in (tmp_path / "policy").iterdir())
+    assert names == ["README.md", "config.json", "model.safetensors", "results.json"]
+
+
+def test_a_film_shows_what_the_environment_draws():
+    """Of the first steps of an episode, large enough to look at."""
+    config = tiny_pixels.config(task="vawm/GridWorld-v0", video=tiny.CONFIG.video, num_envs=1)
+    env = dataclasses.replace(config.env, time_limit=3)
+    config = dataclasses.replace(config, env=env)
+    with suites.make(config) as made:
+        spec = made.spec._replace(made=records.of(made))
+    drawn = export.filmed(make_policy(config, spec), seed=0)
+    assert drawn.shape == (4, 64, 64, 3)
+    assert drawn.dtype == np.uint8
+    assert (drawn == 255).any()
 
 
 # Refusals

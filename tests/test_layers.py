@@ -18,7 +18,8 @@ FLOORS = [
     ["runs"],
     ["policy", "cli"],
     ["evaluate"],
-    ["export", "analysis"],
+    ["analysis"],
+    ["export"],
     ["sweep"],
 ]
 SOLE_IMPORTERS = {

@@ -4,55 +4,67 @@
 
 Wherever vawm is installed, five lines load it and act, without the run's folder:
 
-    import jax, vawm
+    import vawm
     policy = vawm.load("cartpole")
-    env = vawm.envs.make(policy.spec.task, num_envs=1, action_repeat=policy.spec.action_repeat)
-    _, timestep = env.reset(jax.random.key(0))
-    carry, action = policy.act(jax.random.key(1), policy.initial(1), timestep)
+    env = policy.make_env()
+    obs, _ = env.reset(seed=0)
+    action = policy.predict(obs, episode_start=True)
 
 `python -m vawm.evaluate --logdir cartpole` evaluates it. `vawm.policy.weights` describes the
-files.
+files. `--format hub` also writes what hubs of models index and show: the score in the head of
+the card, `results.json`, and `replay.mp4` where the environment can be drawn.
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import math
 import os
 import pathlib
 import sys
+import tempfile
 from collections.abc import Sequence
+from typing import Literal
+
+import gymnasium
+import numpy as np
 
 from vawm import evaluate
 from vawm.agent import parameter_count, registry
+from vawm.analysis import movies
 from vawm.cli import flags
 from vawm.cli.command_line import guard
 from vawm.config import Config
 from vawm.envs import made as records
+from vawm.envs.host.usable import one_line
 from vawm.errors import InvalidInput
-from vawm.policy import Policy, load, weights
+from vawm.policy import Policy, hub, load, weights
 from vawm.policy.play import Score
 from vawm.process import cache, huge_pages, names
 from vawm.runs import checkpoint, suites
 from vawm.runs.checkpoint import manifest
-from vawm.runs.reports import tracking
+from vawm.runs.runner import RunError
 
 LOAD = """\
-import jax, vawm
+import vawm
 
 policy = vawm.load("FOLDER")  # this folder
 """
 USAGE = f"""{LOAD}\
-env = vawm.envs.make(policy.spec.task, num_envs=1, action_repeat=policy.spec.action_repeat)
-_, timestep = env.reset(jax.random.key(0))
-carry, action = policy.act(jax.random.key(1), policy.initial(1), timestep)"""
-HOST_USAGE = f"""import vawm.evaluate
-{LOAD}\
-with vawm.evaluate.environments(policy, episodes=1) as env:  # as in training
-    carry, timestep = policy.initial(env.spec.num_envs), env.reset(0)
-    carry, action = policy.act(jax.random.key(1), carry, timestep)"""
+env = policy.make_env()
+obs, _ = env.reset(seed=0)
+action = policy.predict(obs, episode_start=True)"""
 OWN_USAGE = f"""{LOAD}\
-carry, action = policy.act(jax.random.key(1), policy.initial(1), timestep)  # your timestep"""
-"""How to act once, for the model card: on MJX, on the host, in the user's environment."""
+action = policy.predict(obs, episode_start=True)  # an observation of your environment"""
+"""How to act once, for the model card."""
+MOST_FRAMES = 1000
+"""Longest film; the rest of a longer episode is left out."""
+FILM_SIDE = 256
+"""Pixels that a side of a film has at least: smaller frames are enlarged."""
+RENDER_MODE = "rgb_array"
+
+Format = Literal["plain", "hub"]
 
 
 def export(
@@ -62,6 +74,8 @@ def export(
     policy: Policy | None = None,
     scores: Score | None = None,
     protocol: str = "",
+    layout: Format = "plain",
+    replay: bytes | None = None,
 ) -> pathlib.Path:
     """Writes the policy of the newest checkpoint in `logdir` to `folder`.
 
@@ -73,6 +87,8 @@ def export(
       scores: of an evaluation; without them the model card has the last training return.
       protocol: how the scores were measured; default the suite's protocol with sampled
         actions.
+      layout: "hub" for a folder that hubs of models index.
+      replay: the content of `replay.mp4` there; none without it.
 
     Returns:
       The folder.
@@ -84,10 +100,13 @@ def export(
     logdir, folder = checkpoint.expanded(logdir), checkpoint.expanded(folder, "output")
     weights.check_output(folder)
     policy = policy or load(logdir)
-    measured = _last_return(logdir, policy.env_steps)
-    if scores is not None:
-        protocol = protocol or f"{suites.of(policy.config).protocol.text}; actions sampled"
-        measured = f"Evaluation: return {scores} ({protocol}), mean +- standard error."
+    protocol = protocol or f"{suites.of(policy.config).protocol.text}; actions sampled"
+    head, others = hub.plain_head(), {}
+    if layout == "hub":
+        head = hub.head(policy, scores)
+        others = {hub.RESULTS: hub.results(policy, scores, protocol)}
+        if replay is not None:
+            others[hub.REPLAY] = replay
     weights.write(
         folder,
         policy.params,
@@ -95,30 +114,67 @@ def export(
         config=policy.config,
         spec=policy.spec,
         env_steps=policy.env_steps,
-        card=card(policy, measured),
+        card=card(policy, measured(policy, scores, protocol), head=head),
+        last_return=policy.last_return,
+        others=others,
     )
     return folder
 
 
-def _last_return(logdir: pathlib.Path, env_steps: int) -> str:
-    """The last return of training as a sentence, which says that it is not an evaluation."""
-    path = logdir / tracking.METRICS
-    lines = [
-        entry
-        for entry in tracking.read(path)
-        if entry["env_steps"] <= env_steps and entry.get("episode/return") is not None
-    ]
-    if not lines:
+def measured(policy: Policy, scores: Score | None, protocol: str) -> str:
+    """The score as a sentence, which says whether it is of an evaluation."""
+    if scores is not None:
+        return f"Evaluation: return {scores} ({protocol}), mean +- standard error."
+    if policy.last_return is None:
         return "Not evaluated, and training recorded no return."
-    last = lines[-1]
     return (
-        f"Not evaluated. Last training return: {last['episode/return']:.1f}, the mean over "
-        f"{last['episode/count']} episodes that ended shortly before {last['env_steps']} env "
-        "steps, with the rewards and the exploration of training."
+        f"Not evaluated. Last training return: {policy.last_return}, with the rewards and the "
+        "exploration of training."
     )
 
 
-def card(policy: Policy, measured: str) -> str:
+def film(policy: Policy, *, seed: int = 0) -> bytes:
+    """An MP4 of one episode, as the environment draws itself or as the policy sees it.
+
+    Raises:
+      InvalidInput: the environment cannot be made or drawn.
+      RunError: a package for films is not installed.
+    """
+    movies.check()
+    frames = filmed(policy, seed=seed)
+    enlarge = max(1, math.ceil(FILM_SIDE / min(frames.shape[1:3])))
+    with tempfile.TemporaryDirectory() as folder:
+        path = pathlib.Path(folder) / hub.REPLAY
+        movies.write_mp4(frames, path, enlarge=enlarge)
+        return path.read_bytes()
+
+
+def filmed(policy: Policy, *, seed: int) -> np.ndarray:
+    """`[T, H, W, 3]` uint8 frames of the first steps of one episode.
+
+    Raises:
+      InvalidInput: the environment cannot be made or drawn.
+    """
+    frames, session = [], policy.new_session(seed)
+    with contextlib.closing(policy.make_env(render_mode=RENDER_MODE)) as env:
+        obs, _ = env.reset(seed=seed)
+        over = False
+        try:
+            frames.append(env.render())
+            while not over and len(frames) < MOST_FRAMES:
+                obs, _, terminated, truncated, _ = env.step(session.predict(obs))
+                over = terminated or truncated
+                frames.append(env.render())
+        except gymnasium.error.Error as error:  # for example a package is missing
+            raise InvalidInput("render_mode", RENDER_MODE, one_line(error)) from error
+    pictures = [frame for frame in frames if isinstance(frame, np.ndarray)]
+    if not pictures:
+        raise InvalidInput("render_mode", RENDER_MODE, "the environment draws nothing")
+    stack = np.stack(pictures)
+    return np.repeat(stack, 3, axis=-1) if stack.shape[-1] == 1 else stack[..., :3]
+
+
+def card(policy: Policy, measured: str, *, head: str = "") -> str:
     """The text of `README.md`; `measured` is the sentence about the policy's score."""
     config, spec, made = policy.config, policy.spec, policy.spec.made
     plugin = registry.plugin_of(config.agent)
@@ -139,11 +195,7 @@ def card(policy: Policy, measured: str) -> str:
         "written by": f"vawm {manifest.version()}",
     }
     table = "\n".join(f"| {name} | {value} |" for name, value in rows.items())
-    return f"""---
-license: apache-2.0
-library_name: vawm
-tags: [reinforcement-learning, world-model, jax]
----
+    return f"""{head or hub.plain_head()}---
 
 # {spec.task}, {config.agent}
 
@@ -180,7 +232,7 @@ def _usage(policy: Policy) -> str:
     except InvalidInput:
         if made is None:
             return OWN_USAGE
-    return USAGE if suites.host_choices(config) is None else HOST_USAGE
+    return USAGE
 
 
 def _alignment(config: Config, env_steps: int) -> str:
@@ -206,10 +258,22 @@ class Arguments:
     """folder of the run"""
     output: pathlib.Path
     """folder to write; new or empty"""
-    episodes: int = 0
-    """episodes to play by the suite's protocol, for the model card; 0 for none"""
+    format: Format = "plain"
+    """hub: also what hubs of models index and show"""
+    episodes: int | None = None
+    """episodes to play by the suite's protocol, for the model card. If not given, none; for a
+    hub as many as the protocol says"""
     seed: int = 0
     """seed of these episodes"""
+
+
+def wanted_episodes(arguments: Arguments, policy: Policy) -> int:
+    """How many episodes to play for the card."""
+    if arguments.episodes is not None:
+        return arguments.episodes
+    if arguments.format == "plain" or not records.can_be_made_again(policy.spec.made):
+        return 0
+    return suites.of(policy.config).protocol.episodes
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -217,11 +281,23 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = flags.read(Arguments, argv, description=__doc__)
     weights.check_output(checkpoint.expanded(arguments.output, "output"))
     evaluate.check(arguments.episodes or 1, arguments.seed)
-    policy, scores = load(arguments.logdir), None
-    if arguments.episodes:
+    policy, scores, replay = load(arguments.logdir), None, None
+    if episodes := wanted_episodes(arguments, policy):
         cache.enable()
-        scores = evaluate.by_protocol(policy, episodes=arguments.episodes, seed=arguments.seed)
-    folder = export(arguments.logdir, arguments.output, policy=policy, scores=scores)
+        scores = evaluate.by_protocol(policy, episodes=episodes, seed=arguments.seed)
+    if arguments.format == "hub":
+        try:
+            replay = film(policy, seed=arguments.seed)
+        except (InvalidInput, RunError) as error:
+            print(f"without {hub.REPLAY}: {error}")
+    folder = export(
+        arguments.logdir,
+        arguments.output,
+        policy=policy,
+        scores=scores,
+        layout=arguments.format,
+        replay=replay,
+    )
     print(f"exported to {names.shown(folder)}" + (f", return {scores}" if scores else ""))
     print(f"evaluate with: python -m vawm.evaluate {names.flag('logdir', folder)}")
     return 0

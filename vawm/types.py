@@ -81,6 +81,8 @@ class EnvSpec(NamedTuple):
       action_repeat: control steps per call of `step`.
       episode_length: calls of `step` in a full episode; None if it varies.
       made: how they were made; the runner fills it in. None in runs of earlier versions.
+      native: a `vawm.envs.host.native.Native`, how the observations and actions of the
+        environment itself become these; None where they are these, as in DMC and Atari.
     """
 
     task: str
@@ -91,6 +93,7 @@ class EnvSpec(NamedTuple):
     action_repeat: int
     episode_length: int | None
     made: Made | None = None
+    native: Any = None
 
 
 class TimeStep(NamedTuple):

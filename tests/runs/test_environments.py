@@ -19,9 +19,10 @@ from vawm import evaluate, export
 from vawm.config import AtariConfig, GymnasiumConfig
 from vawm.envs import made
 from vawm.envs.grid_world import GridWorld
+from vawm.envs.host.native import of_spec
 from vawm.policy import Policy
 from vawm.runs import resume, run_folder, runner, suites
-from vawm.types import Made
+from vawm.types import Made, vector
 
 HOST = tiny.config(suite="gymnasium", task="CartPole-v1", env=GymnasiumConfig(workers=1))
 
@@ -54,6 +55,7 @@ def test_a_registered_id_is_made_again_with_its_arguments():
     record = Made("gymnasium", "CartPole-v1", options, given)
     assert spec.made._replace(registered={}) == record
     assert spec.made.registered["entry_point"].endswith("CartPoleEnv")
+    assert spec.native.reading.spec == vector(4)
     with evaluate.environments(policy_of(spec), episodes=1) as env:
         assert spec_of(env) == spec
         assert steps_of_episode(env) == 5
@@ -228,6 +230,19 @@ def test_another_environment_is_refused_on_resume(tmp_path, name, change):
         resume.check_environments(tmp_path, now)
 
 
+def test_other_bounds_of_actions_are_refused_on_resume(tmp_path):
+    """Except for a run of an earlier version, which did not keep them."""
+    spec = SPEC._replace(native=of_spec(SPEC))
+    bounds = spec.native.actions._replace(high=(2.0,))
+    now = spec._replace(native=spec.native._replace(actions=bounds))
+    save_toy(tmp_path / "run", toy.state(), spec=spec)
+    assert resume.check_environments(tmp_path / "run", spec) == []
+    with refused("env.native"):
+        resume.check_environments(tmp_path / "run", now)
+    save_toy(tmp_path / "earlier", toy.state(), spec=SPEC)
+    assert resume.check_environments(tmp_path / "earlier", now) == []
+
+
 def test_another_spec_is_refused_on_resume(tmp_path):
     save_toy(tmp_path, toy.state(), spec=SPEC)
     with refused("env.action_size", 4, naming="1"):
@@ -268,4 +283,4 @@ def test_the_model_card_names_the_environment():
     spec = toy.SPEC._replace(made=Made("object", "mine.Line", {"time_limit": 9}))
     card = export.card(policy_of(spec)._replace(params={}), "Not evaluated.")
     assert "mine.Line (time_limit=9)" in card
-    assert "your timestep" in card
+    assert "an observation of your environment" in card

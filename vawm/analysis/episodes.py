@@ -216,6 +216,8 @@ def check_can_watch(name: str, spec: EnvSpec, player: EnvSpec) -> None:
     """
     for field in EnvSpec._fields:
         own, theirs = getattr(spec, field), getattr(player, field)
+        if field == "native" and None in (own, theirs):  # of an earlier version
+            continue
         if own != theirs and field not in ("num_envs", "episode_length"):
             remedy = f"{name} was trained with {own}; choose a player trained with the same"
             raise InvalidInput("player", f"{field} {theirs}", remedy)

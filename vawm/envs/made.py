@@ -91,10 +91,13 @@ class Difference(NamedTuple):
 
 
 def differences(then: EnvSpec, now: EnvSpec) -> Iterator[Difference]:
-    """What differs between two environments; of `made` only if both have it."""
+    """What differs between two environments; of what earlier versions did not keep, `made` and
+    `native`, only if both have it."""
     for name in EnvSpec._fields:
-        if name != "made" and getattr(then, name) != getattr(now, name):
-            yield Difference(name, getattr(then, name), getattr(now, name))
+        values = getattr(then, name), getattr(now, name)
+        told = name != "native" or None not in values
+        if name != "made" and told and values[0] != values[1]:
+            yield Difference(name, *values)
     if then.made is None or now.made is None:
         return
     for name in ("by", "name"):

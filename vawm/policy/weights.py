@@ -4,6 +4,8 @@
     config.json         config, environment spec, version, SHA-256 of model.safetensors
     README.md           a model card, for people only
 
+A folder for a hub of models has more files, which are not read: see `vawm.policy.hub`.
+
 Names are paths in the tree, such as `params.actor['layer_0']['kernel']`; dtypes are kept.
 Nothing is pickled. Before any array is allocated, the file is compared by name, shape and dtype
 with what the config builds, and then with its checksum.
@@ -26,6 +28,8 @@ import safetensors.numpy
 
 from vawm.config import Config, as_dict
 from vawm.errors import InvalidInput
+from vawm.policy import returned
+from vawm.policy.returned import LastReturn
 from vawm.process import names
 from vawm.runs import checkpoint, run_folder, validate
 from vawm.runs.checkpoint import manifest
@@ -75,6 +79,7 @@ class Description(NamedTuple):
       config: of the run.
       spec: of the environment.
       sha256: of `model.safetensors`.
+      last_return: of training; None if it is not known.
     """
 
     version: str
@@ -82,6 +87,7 @@ class Description(NamedTuple):
     config: Config
     spec: EnvSpec
     sha256: str
+    last_return: LastReturn | None = None
 
 
 def found(folder: str | os.PathLike[str]) -> bool:
@@ -116,8 +122,21 @@ def write(
     spec: EnvSpec,
     env_steps: int,
     card: str,
+    last_return: LastReturn | None = None,
+    others: Mapping[str, bytes] | None = None,
 ) -> None:
     """Writes the three files to a temporary folder, then renames it to `folder`.
+
+    Args:
+      folder: new or empty.
+      params: of the policy.
+      model_state: of its world model.
+      config: of the run.
+      spec: of its environment.
+      env_steps: at which the parameters were saved.
+      card: the text of `README.md`.
+      last_return: of training, if it is known.
+      others: further files, name -> content.
 
     Raises:
       InvalidInput: `folder` exists and is not empty, or `read` would refuse the config.
@@ -135,6 +154,7 @@ def write(
         "env_steps": env_steps,
         "config": as_dict(config),
         "spec": manifest.spec_as_dict(spec),
+        "last_return": None if last_return is None else last_return._asdict(),
     }
     try:
         scratch.mkdir(parents=True)
@@ -142,6 +162,8 @@ def write(
         content["sha256"] = manifest.sha256(scratch / MODEL)
         (scratch / CONFIG).write_text(json.dumps(content, indent=2) + "\n")
         (scratch / CARD).write_text(card, encoding="utf-8")
+        for name, data in (others or {}).items():
+            (scratch / name).write_bytes(data)
         (scratch / MODEL).chmod((scratch / CARD).stat().st_mode)  # safetensors sets 0600
         for path in (*scratch.iterdir(), scratch):
             manifest.sync(path)
@@ -170,6 +192,7 @@ def describe(folder: str | os.PathLike[str]) -> Description:
             config=manifest.config_from_dict(content["config"]),
             spec=manifest.spec_from_dict(content["spec"]),
             sha256=content["sha256"],
+            last_return=returned.from_dict(content.get("last_return")),
         )
         validate.check(description.config)
         validate.check_spec(description.config, description.spec)

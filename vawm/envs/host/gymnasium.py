@@ -13,19 +13,18 @@ import contextlib
 import functools
 import importlib
 import importlib.util
-import math
 import re
 import sys
 from collections.abc import Callable, Mapping
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import gymnasium
 import numpy as np
-from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec as RegisteredEnv
 from gymnasium.wrappers import TimeLimit
 
 from vawm.envs import made
+from vawm.envs.host import native
 from vawm.envs.host.atari import GAMES
 from vawm.envs.host.gymnasium_check import IMAGE_SIZE, problems, refuse, space_problems
 from vawm.envs.host.pool import Pool, check_maker
@@ -48,9 +47,9 @@ PACKAGES = {
 class GymnasiumSimulator:
     """A Gymnasium environment as a `Simulator`.
 
-    Actions: [-1, 1] is scaled to the bounds of a `Box`; a `Discrete` keeps its choices.
-    Observations: as `vawm.envs.host.reading` says. `terminated` sets `is_terminal` and
-    `is_last`; `truncated` sets `is_last`.
+    Observations are read as `vawm.envs.host.reading` says, actions taken as
+    `vawm.envs.host.native` says. `terminated` sets `is_terminal` and `is_last`; `truncated`
+    sets `is_last`.
     """
 
     def __init__(self, env: gymnasium.Env, image_size: int = IMAGE_SIZE):
@@ -65,13 +64,14 @@ class GymnasiumSimulator:
         """
         refuse(str(env), space_problems(env, image_size))
         self._env = env
-        self._reading = read(env.observation_space, image_size=image_size)
-        actions = cast(Any, env.action_space)
-        self._actions = actions
+        self.native = native.of_spaces(
+            env.observation_space, env.action_space, image_size=image_size
+        )
+        self._reading, self._actions = self.native
         self.obs: PyTree = self._reading.spec
-        self.notices = self._reading.notices
-        self.discrete = isinstance(actions, spaces.Discrete)
-        self.action_size = int(actions.n) if self.discrete else math.prod(actions.shape)
+        self.notices = read(env.observation_space, image_size=image_size).notices
+        self.discrete = self._actions.discrete
+        self.action_size = self._actions.size
         self.episode_length: int | None = None  # it may end earlier than its time limit
 
     def reset(self, seed: int) -> PyTree:
@@ -79,7 +79,8 @@ class GymnasiumSimulator:
         return self._reading.convert(obs)
 
     def step(self, action: np.ndarray | int) -> Outcome:
-        obs, reward, terminated, truncated, _ = self._env.step(self._action(action))
+        native_action = self._actions.convert(action)
+        obs, reward, terminated, truncated, _ = self._env.step(native_action)
         is_terminal = check_flag("terminated", terminated)
         return Outcome(
             obs=self._reading.convert(obs),
@@ -90,17 +91,6 @@ class GymnasiumSimulator:
 
     def close(self) -> None:
         self._env.close()
-
-    def _action(self, action: np.ndarray | int) -> Any:
-        """The environment's action for an action in [-1, 1] or for an index."""
-        dtype = self._actions.dtype.type
-        if self.discrete:
-            return dtype(self._actions.start + action)
-        low, high = self._actions.low, self._actions.high
-        # Halve first: high - low may overflow. Symmetric bounds lose no bit.
-        center, reach = low / 2 + high / 2, high / 2 - low / 2
-        native = center + reach * np.reshape(action, low.shape).astype(dtype)
-        return np.clip(native, low, high)
 
 
 def from_gymnasium(

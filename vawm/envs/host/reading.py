@@ -194,12 +194,14 @@ class Reading(NamedTuple):
       notices: what a user should know of it, one line each.
       problems: (name, text with remedy) of each part that cannot be read. A reading with
         problems converts nothing.
+
+    A run keeps its entries and containers, see `vawm.envs.host.native`.
     """
 
     entries: tuple[Entry, ...]
     containers: tuple[Container, ...]
-    notices: tuple[str, ...]
-    problems: tuple[tuple[str, str], ...]
+    notices: tuple[str, ...] = ()
+    problems: tuple[tuple[str, str], ...] = ()
 
     @property
     def spec(self) -> PyTree:
@@ -414,6 +416,19 @@ def as_array(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
     Raises:
       Unusable: it cannot be one, or has another shape.
     """
+    array = as_numbers(name, value)
+    if array.shape != shape:
+        what = f"has shape {array.shape}, but its space {shape}"
+        raise Unusable(name, what, "change one of them")
+    return array
+
+
+def as_numbers(name: str, value: Any) -> np.ndarray:
+    """A numpy array of numbers, of any shape.
+
+    Raises:
+      Unusable: the value cannot be one.
+    """
     try:
         array = np.asarray(value)
     except Exception as error:  # lists of different lengths, arrays on another device, ...
@@ -421,7 +436,4 @@ def as_array(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
         raise Unusable(name, what, "return a numpy array") from error
     if array.dtype.kind in "OUSVcMm" and array.dtype.name != "bfloat16":
         raise Unusable(name, f"holds {array.dtype}, not numbers", "return a numpy array")
-    if array.shape != shape:
-        what = f"has shape {array.shape}, but its space {shape}"
-        raise Unusable(name, what, "change one of them")
     return array

@@ -38,7 +38,8 @@ class Simulator(Protocol):
       discrete: whether actions are choices.
       episode_length: steps of a full episode, None if it varies.
 
-    An attribute `notices`, if there is one, is a tuple of lines to say when a run starts.
+    An attribute `notices`, if there is one, is a tuple of lines to say when a run starts. An
+    attribute `native`, if there is one, is that of `EnvSpec`.
     """
 
     obs: PyTree
@@ -54,3 +55,11 @@ class Simulator(Protocol):
 
     def close(self) -> None:
         """Frees all resources; no call follows."""
+
+
+def legal(raw: np.ndarray, *, discrete: bool) -> np.ndarray | int:
+    """What `Simulator.step` takes, for a raw action `[action_size]`; NaN counts as 0."""
+    action = np.where(np.isnan(raw), np.float32(0), raw)
+    if discrete:
+        return int(np.argmax(action))
+    return np.clip(action, -1, 1)

@@ -21,12 +21,14 @@ class Unusable(ValueError):
 
     Attributes:
       name: of the value, such as "reward" or "obs['camera']".
+      what: is wrong with it, such as "is None, not a number".
       remedy: what to do in the environment; may be "".
     """
 
     def __init__(self, name: str, what: str, remedy: str = ""):
         super().__init__(f"{name} {what}")
         self.name = name
+        self.what = what
         self.remedy = remedy
 
 

@@ -29,7 +29,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vawm.envs.host.channel import Channel, Fields, view
-from vawm.envs.host.simulator import Outcome, Simulator
+from vawm.envs.host.simulator import Outcome, Simulator, legal
 from vawm.envs.host.usable import Unusable, check_array, check_flag, check_number, one_line
 from vawm.errors import InvalidInput
 from vawm.process import streams
@@ -50,6 +50,7 @@ class Description(NamedTuple):
     discrete: bool
     episode_length: int | None
     notices: tuple[str, ...] = ()
+    native: Any = None
 
     def of_spec(self) -> dict[str, Any]:
         """Those that are fields of an `EnvSpec`."""
@@ -200,11 +201,8 @@ class Worker:
         return [(*leaf, self.arrays[leaf[0]]) for leaf in leaves(self.description.obs)]
 
     def action(self, raw: np.ndarray) -> np.ndarray | int:
-        """Converts a raw action `[action_size]` for the simulator; NaN counts as 0."""
-        action = np.where(np.isnan(raw), np.float32(0), raw)
-        if self.description.discrete:
-            return int(np.argmax(action))
-        return np.clip(action, -1, 1)
+        """Converts a raw action `[action_size]` for the simulator."""
+        return legal(raw, discrete=self.description.discrete)
 
     def write(self, env: int, outcome: Outcome) -> None:
         """Writes an outcome to shared memory, after checking all of it."""
@@ -259,6 +257,7 @@ def describe_simulator(simulator: Simulator) -> Description:
         simulator.discrete,
         simulator.episode_length,
         notices=tuple(getattr(simulator, "notices", ())),
+        native=getattr(simulator, "native", None),
     )
     for name, key, spec in leaves(said.obs):
         if not isinstance(spec, ArraySpec) or not isinstance(key, (str, type(None))):

@@ -23,6 +23,8 @@ from vawm.agent import registry
 from vawm.agent.registry import UnknownAgent
 from vawm.config import Config, as_dict, kinds
 from vawm.envs import made as records
+from vawm.envs.host import native_record
+from vawm.envs.host.native import fits
 from vawm.errors import InvalidInput
 from vawm.runs import suites, validate
 from vawm.types import ArraySpec, EnvSpec, PyTree
@@ -154,8 +156,11 @@ def computed() -> str:
 
 def spec_as_dict(spec: EnvSpec) -> dict[str, Any]:
     """Converts `spec` for JSON."""
-    content = spec._asdict() | {"obs": _obs_as_dict(spec.obs)}
-    return content | {"made": None if spec.made is None else records.as_dict(spec.made)}
+    return spec._asdict() | {
+        "obs": _obs_as_dict(spec.obs),
+        "made": None if spec.made is None else records.as_dict(spec.made),
+        "native": None if spec.native is None else native_record.as_dict(spec.native),
+    }
 
 
 def spec_from_dict(content: dict[str, Any]) -> EnvSpec:
@@ -163,12 +168,18 @@ def spec_from_dict(content: dict[str, Any]) -> EnvSpec:
     types: dict[str, type | tuple[type, ...]]
     types = {"task": str, "obs": dict, "action_size": int, "discrete": bool}
     types |= {"num_envs": int, "action_repeat": int, "episode_length": (int, type(None))}
-    types |= {"made": (dict, type(None))}
-    if isinstance(content, dict):
-        content = {"made": None, **content}  # earlier versions did not keep it
-    spec = _record(content, types)
-    made = None if spec["made"] is None else records.from_dict(spec["made"])
-    return EnvSpec(**spec | {"obs": _obs_from_dict(spec["obs"]), "made": made})
+    types |= dict.fromkeys(("made", "native"), (dict, type(None)))
+    if isinstance(content, dict):  # earlier versions did not keep them
+        content = {"made": None, "native": None, **content}
+    content = _record(content, types)
+    spec = EnvSpec(**content | {"obs": _obs_from_dict(content["obs"])})
+    if content["made"] is not None:
+        spec = spec._replace(made=records.from_dict(content["made"]))
+    if content["native"] is not None:
+        spec = spec._replace(native=native_record.from_dict(content["native"]))
+        if not fits(spec.native, spec):
+            raise ValueError("the spaces of the environment do not fit its spec")
+    return spec
 
 
 def leaf_info(leaf: Any) -> LeafInfo:

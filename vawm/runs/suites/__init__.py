@@ -9,8 +9,11 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+from gymnasium import Env
+
 from vawm.config import Config, GymnasiumConfig, HostEnvConfig
 from vawm.envs import made as records
+from vawm.envs.gym import HostEnv, PureEnv
 from vawm.envs.host.gymnasium import check_registration
 from vawm.envs.protocol import Environment, HostEnvironment
 from vawm.errors import InvalidInput
@@ -27,6 +30,7 @@ __all__ = [
     "host_choices",
     "make",
     "make_again",
+    "make_one",
     "of",
 ]
 
@@ -117,8 +121,57 @@ def make_again(
     Raises:
       InvalidInput: they were made by code of the caller's, or cannot be made here.
     """
+    config, kwargs = as_recorded(config, made, python=python, **changes)
+    if isinstance(config.env, GymnasiumConfig) and made is not None:
+        return gymnasium.make(config, config.env, task=task, kwargs=kwargs)
+    return make(config)
+
+
+def make_one(
+    config: Config, made: Made | None, *, python: str, render_mode: str | None = None
+) -> Env:
+    """One environment as those that a run was trained in, as a `gymnasium.Env`.
+
+    It has the observations and actions of the environment itself, and runs in this process if
+    Gymnasium makes it. Close it.
+
+    Args:
+      config: of the run.
+      made: the record; None in a run of an earlier version.
+      python: as in `make_again`.
+      render_mode: of a registered environment any that it has; "rgb_array" where observations
+        have an image.
+
+    Raises:
+      InvalidInput: it was made by code of the caller's, cannot be made here, or cannot be
+        rendered.
+    """
+    config, kwargs = as_recorded(config, made, python=python)
+    if isinstance(config.env, GymnasiumConfig):
+        rendered = {} if render_mode is None else {"render_mode": render_mode}
+        return gymnasium.make_one(config, config.env, kwargs | rendered)
+    drawn = isinstance(config.env, HostEnvConfig) and of(config).has_images
+    if render_mode not in (known := (None, "rgb_array") if drawn else (None,)):
+        remedy = f"environments of {config.suite} are not drawn like this; use "
+        raise InvalidInput("render_mode", render_mode, remedy + " or ".join(map(str, known)))
+    if isinstance(config.env, HostEnvConfig):
+        on_host = dataclasses.replace(config.env, on_failure="raise")
+        config = dataclasses.replace(config, env=on_host)
+    env = make(dataclasses.replace(config, num_envs=1))
+    return PureEnv(env) if isinstance(env, Environment) else HostEnv(env, render_mode)
+
+
+def as_recorded(
+    config: Config, made: Made | None, *, python: str, **changes: Any
+) -> tuple[Config, dict[str, Any]]:
+    """The choices of a run as its record has them, with `changes`; and keyword arguments.
+
+    Raises:
+      InvalidInput: its environments were made by code of the caller's, or by an unknown suite.
+    """
     if made is None:
-        return make(dataclasses.replace(config, env=dataclasses.replace(config.env, **changes)))
+        env = dataclasses.replace(config.env, **changes)
+        return dataclasses.replace(config, env=env), {}
     check_made(made, python=python)
     if made.by not in SUITES:
         raise InvalidInput("env", records.describe(made), f"suite {made.by} is unknown here")
@@ -128,17 +181,14 @@ def make_again(
     recorded = {n: value for n, value in made.options.items() if n in known}
     if suite.choices is GymnasiumConfig:
         recorded["time_limit"] = made.options.get("time_limit") or 0
-    choices = dataclasses.replace(choices, **recorded | changes)
     config = dataclasses.replace(
         config,
         suite=made.by,
         task=made.name,
         action_repeat=made.options.get("action_repeat", config.action_repeat),
-        env=choices,
+        env=dataclasses.replace(choices, **recorded | changes),
     )
-    if suite.choices is GymnasiumConfig:
-        return gymnasium.make(config, choices, task=task, kwargs=made.kwargs)  # type: ignore[arg-type]
-    return make(config)
+    return config, made.kwargs
 
 
 def host_choices(config: Config) -> HostEnvConfig | None:

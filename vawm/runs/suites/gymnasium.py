@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from gymnasium import Env
+
 from vawm.config import Config, GymnasiumConfig
 from vawm.envs.host import gymnasium
 from vawm.envs.host.pool import Pool
@@ -57,6 +59,21 @@ def make(
         )
     except InvalidInput as error:
         raise within("env", error) from error
+
+
+def make_one(config: Config, env: GymnasiumConfig, kwargs: Mapping[str, Any]) -> Env:
+    """One environment of a run in this process, with its own observations and actions.
+
+    Args:
+      config: of the run.
+      env: its choices of the environments.
+      kwargs: for the environment itself, such as `render_mode`.
+
+    Raises:
+      InvalidInput: it is not registered, or cannot be made.
+    """
+    source = gymnasium.check_id(config.task)
+    return gymnasium.make_environment(source, config.task, env.time_limit or None, kwargs)
 
 
 SUITE = Suite(
