@@ -241,7 +241,8 @@ class ValueAlignmentConfig:
     """L_var, Eq. 4 and Eq. 5. The loss and its weight are logged even when off."""
 
     weight: Literal["adaptive", "static", "off"] = "adaptive"
-    """adaptive: 1 / max(1, KL) of each state, Eq. 5; off: plain DreamerV3 or STORM"""
+    """weight of L_var; adaptive: 1 / max(1, KL) of each state, Eq. 5; off: plain DreamerV3 or
+    STORM"""
     static_weight: float = 0.5
     """the weight after the warm-up with weight="static"; Table 3"""
     warmup_steps: int = 10_000
@@ -421,7 +422,7 @@ class Config:
     task: str = "cartpole_swingup"
     """name of the environment in its suite"""
     agent: AgentName = "dreamerv3"
-    """the world model: recurrent (dreamerv3), a transformer (storm), recurrent without noise
+    """the world model; recurrent (dreamerv3), a transformer (storm), recurrent without noise
     (vagram), or one that was registered"""
     preset: str = "paper"
     """set of defaults for the other numbers; custom: all set by flags"""
