@@ -110,6 +110,19 @@ def test_bad_input_is_one_line_and_code_2(experiment, suite, flags, message, cap
     assert not list(pathlib.Path().iterdir())
 
 
+def test_a_wrong_task_is_told_before_wrong_numbers(tmp_path):
+    def check(task):
+        config = dataclasses.replace(presets.QUICK, task=task, env_steps=0)
+        runner.check(config, tmp_path, resume=False)
+
+    with refused("task", "walker_wlak", naming="'walker_walk'"):
+        check("walker_wlak")
+    with refused("task", 3):
+        check(3)
+    with refused("env_steps", 0):
+        check("walker_walk")
+
+
 def test_remedies_name_fields_in_python_and_flags_on_the_command_line(capsys):
     """A problem of the look, with the setting that ends it."""
     env = dataclasses.replace(presets.GYMNASIUM_QUICK.env, workers=1)
