@@ -25,11 +25,11 @@ RESULTS = ROOT / "experiments" / "results"
 
 ORDER = {
     "Losses": ("losses",),
-    "Data and choices": ("types", "config", "presets", "errors"),
+    "Data and choices": ("types", "config", "errors"),
     "World models and agents": ("world_model", "agent", "nets"),
     "Environments": ("envs",),
     "Learning": ("learning",),
-    "Runs": ("runs", "process", "cli"),
+    "Runs": ("runs", "process", "cli", "__main__"),
     "Evaluation": ("policy", "evaluate", "export"),
     "Comparison": ("analysis", "sweep"),
 }

@@ -20,9 +20,7 @@ from vawm.process import huge_pages
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Trains one agent; returns the exit code."""
-    return command_line.train(
-        argv, suite="atari100k", description=__doc__, aliases={"--game": "--task"}
-    )
+    return command_line.train(argv, suite="atari100k", description=__doc__)
 
 
 if __name__ == "__main__":

@@ -62,7 +62,9 @@ class Benchmark:
     size: str | None = None
     """model size; default 16m for storm, the smallest for other agents"""
     batch_size: int = 16
+    """sequences in a batch"""
     batch_length: int = 64
+    """steps of each"""
     obs: Literal["vector", "pixels"] = "vector"
     """pixels: RGB images, and 18 discrete actions as in Atari"""
     observations: int = 24
@@ -70,12 +72,15 @@ class Benchmark:
     actions: int = 6
     """continuous actions with a vector"""
     image_size: int = 64
+    """pixels a side, with --obs pixels"""
     repeats: int = 16
     """timed updates of each kind"""
     compute_dtype: Literal["auto", "float32", "bfloat16"] = "auto"
+    """auto: bfloat16 on GPU and TPU, float32 on CPU"""
     task: str = "cartpole_swingup"
     """environment for env_steps_per_s"""
     num_envs: int = 16
+    """environments side by side for env_steps_per_s"""
     env_calls: int = 100
     """steps of every environment in the timed collection"""
     fast_rendering: bool = False

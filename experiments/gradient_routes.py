@@ -52,8 +52,11 @@ class Options:
     """The size of the measurement."""
 
     seeds: int = 3
+    """initial parameters and batches to measure"""
     batch_size: int = 2
+    """sequences in a batch"""
     batch_length: int = 16
+    """steps of each"""
     states: int = 4096
     """states to compare values of"""
 

@@ -17,6 +17,7 @@ import pytest
 import scipy.special
 import tiny
 
+from vawm import __main__ as front_door
 from vawm import envs, policy
 from vawm.agent import make_agent, plugins, registry
 from vawm.cli import command_line, flags
@@ -45,7 +46,10 @@ PROGRAMS = {path.stem: load(path) for path in (ROOT / "experiments").rglob("*.py
 WITH_OWN = dict(registry._ROWS)  # with what a program has registered
 registry._ROWS.clear()
 registry._ROWS.update(ROWS)  # other tests of this process know no more than the package
-PROGRAMS |= {  # those of the package, `python -m`
+PROGRAMS |= {  # those of the package, `python -m` and `vawm`
+    door.module: importlib.import_module(door.module) for door in front_door.PROGRAMS.values()
+}
+PROGRAMS |= {
     f"vawm.{path.stem}": importlib.import_module(f"vawm.{path.stem}")
     for path in (ROOT / "vawm").glob("*.py")
     if "\ndef main(" in path.read_text()
@@ -54,6 +58,7 @@ PROGRAMS |= {  # those of the package, `python -m`
 
 def options(program):
     """The dataclass that a program reads its flags into; None for a training run."""
+    program = sys.modules[program.main.__module__]  # behind a thin door
     source = inspect.getsource(program)
     found = re.search(r"flags\w*\.read\((\w+),", source)
     if found:
@@ -223,12 +228,14 @@ def test_the_readme_lists_every_suite_with_the_presets_of_every_agent():
 def commands(text):
     """Words of every command that starts one of our programs: (program, arguments)."""
     lines = "\n".join(blocks(text, "bash")).splitlines()
-    lines += re.findall(r"`(python [^`]+)`", prose(text))
+    lines += re.findall(r"`((?:python|vawm) [^`]+)`", prose(text))
     for line in lines:
         for part in line.replace("\n", " ").split("&&"):
             words = shlex.split(part, comments=True)
             if words[:1] == ["python"] and words[1:] != [] and words[1] != "-c":
                 yield tuple(words[2:] if words[1] == "-m" else words[1:])
+            if words[:1] == ["vawm"]:
+                yield tuple(words)
 
 
 COMMANDS = sorted({command for text in TEXTS.values() for command in commands(text)})
@@ -237,12 +244,22 @@ COMMANDS = sorted({command for text in TEXTS.values() for command in commands(te
 @pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
 def test_a_command_is_one_that_would_start(command, monkeypatch):
     program, *argv = command
+    given = {}
+    if program == "vawm" and argv[:1] == ["train"]:
+        program, given, argv = "vawm.cli.train", {"suite": argv[1]}, argv[2:]
+    elif program == "vawm" and argv and argv[0] in front_door.PROGRAMS:
+        program, argv = front_door.PROGRAMS[argv[0]].module, argv[1:]
+    elif program == "vawm":
+        assert front_door.main(argv) == 0
+        return
     monkeypatch.setenv(plugins.VARIABLE, "")
     monkeypatch.setattr(registry, "_ROWS", WITH_OWN)
     program = pathlib.Path(program).stem if "/" in program else program
     if OPTIONS[program]:
-        needs = "logdir" in OPTIONS[program].__dataclass_fields__ and "--logdir" not in argv
-        flags.read(OPTIONS[program], argv + ["--logdir", "LOGDIR"] * needs)
+        for flag in ("--logdir", "--logdirs"):
+            if flag[2:] in OPTIONS[program].__dataclass_fields__ and flag not in argv:
+                argv += [flag, "LOGDIR"]
+        flags.read(OPTIONS[program], argv)
         return
 
     def check(argv, **choices):
@@ -252,11 +269,23 @@ def test_a_command_is_one_that_would_start(command, monkeypatch):
         validate.check(parsed.config)
         suites.check_task(parsed.config)
 
+    if given:
+        check(argv, **given)
+        return
     monkeypatch.setattr(command_line, "train", check)
     main = PROGRAMS[program].main
     if not argv and not inspect.signature(main).parameters:
         return  # one without flags, which has a test of its own
     main(argv)
+
+
+def test_every_flag_of_every_program_has_a_sentence():
+    said = [
+        flags.sentences(command_line.Flags, command_line.Flags(config)) for config in configs()
+    ]
+    said += [flags.sentences(cls) for cls in OPTIONS.values() if cls]
+    assert len(said) > 20
+    assert not {flag for of_one in said for flag, text in of_one.items() if not text}
 
 
 @pytest.mark.parametrize("page", TEXTS)

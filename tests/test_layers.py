@@ -11,7 +11,7 @@ PACKAGE = pathlib.Path(__file__).parents[1] / "vawm"
 # From the ground up: a room may import those before it. Rooms are modules or folders.
 FLOORS = [
     ["errors", "process", "config", "types", "losses"],
-    ["presets", "nets", "envs"],
+    ["nets", "envs"],
     ["world_model"],
     ["agent"],
     ["learning"],
@@ -21,6 +21,7 @@ FLOORS = [
     ["analysis"],
     ["export"],
     ["sweep"],
+    ["__main__"],
 ]
 SOLE_IMPORTERS = {
     "flax": "nets/",

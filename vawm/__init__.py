@@ -1,7 +1,7 @@
 """Value-aligned world models in JAX.
 
     vawm.losses         the losses as a functional library, and what they are made of
-    vawm.types, vawm.config, vawm.presets   the data, the choices, the paper's and small ones
+    vawm.types, vawm.config   the data, and the choices; vawm.presets: the paper's, small ones
     vawm.world_model, vawm.agent            world models; what imagines and acts in them
     vawm.envs           the DeepMind Control Suite on MJX and rendered, Gymnasium, Atari
     vawm.learning       the objective, one update, replay, the jitted training step
@@ -25,11 +25,13 @@ __all__ = ["__version__", "load"]
 
 
 def __getattr__(name: str) -> Any:
-    """`vawm.load` and submodules, imported when they are first asked for."""
+    """`vawm.load`, `vawm.presets` and submodules, imported when they are first asked for."""
     if name == "load":
         from vawm.policy import load
 
         return load
+    if name == "presets":
+        return importlib.import_module("vawm.config.presets")
     if not name.startswith("_"):
         try:
             return importlib.import_module(f"vawm.{name}")

@@ -206,6 +206,7 @@ class Arguments:
     sticky: float = 0.0
     """probability of sticky actions; for atari100k"""
     seed: int = 0
+    """of the episodes and of the actions"""
 
 
 def main(argv: Sequence[str] | None = None) -> int:

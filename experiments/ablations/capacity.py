@@ -83,8 +83,7 @@ IMAGE = ablation.Ablation(
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Trains and writes the table; returns the exit code, 1 if a run failed."""
-    default = Options(results=ablation.results_folder(__file__))
-    options = flags.read(Options, argv, default=default, description=__doc__)
+    options = flags.read(Options, argv, description=__doc__)
     chosen = {"model": MODEL, "image": IMAGE}[options.vary]
     return ablation.run(chosen, options, script=__file__)
 

@@ -9,9 +9,9 @@ import pytest
 import tiny
 
 from vawm.agent import make_agent, parameter_count, resolve_dtype, with_size
+from vawm.config.presets import PAPER
 from vawm.envs import probes
 from vawm.errors import InvalidInput
-from vawm.presets import PAPER
 from vawm.types import EnvSpec, TimeStep, image, vector
 
 # The official DreamerV3's counts for 24 observations and 6 continuous actions.

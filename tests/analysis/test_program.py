@@ -1,4 +1,4 @@
-"""experiments/analyse.py: bad input in one line, and the results of a whole analysis."""
+"""The command line: bad input in one line, and the results of a whole analysis."""
 
 import csv
 import importlib.util
@@ -20,6 +20,7 @@ from analysis_records import make_episodes, make_policy, save_run
 from PIL import Image
 
 from vawm.analysis import figures, tables
+from vawm.analysis import program as analyse
 from vawm.cli import command_line
 from vawm.sweep import ablation, runs
 from vawm.types import vector
@@ -36,9 +37,6 @@ def load(name, path):
     sys.modules[name] = module  # where dataclasses look their types up
     spec.loader.exec_module(module)
     return module
-
-
-analyse = load("analyse", "analyse.py")
 
 
 @pytest.fixture(scope="module")
@@ -137,7 +135,7 @@ def test_bad_input_is_one_line_and_code_2(
 def test_a_missing_package_is_reported_before_anything_is_computed(run, capsys, monkeypatch):
     monkeypatch.setattr(figures.importlib.util, "find_spec", lambda _: None)
     monkeypatch.setattr(analyse, "play", None)
-    assert command_line.guard(lambda: analyse.main(["--logdirs", run])) == 1
+    assert command_line.guard(lambda: analyse.main(["--logdirs", run])) == 2
     told = capsys.readouterr().err
     assert "matplotlib" in told
     assert "pip install" in told
@@ -337,7 +335,7 @@ def test_the_guide_names_the_folders_of_its_ablations():
     assert len(found) == 2
     for flags, variable, where in found:
         options = analyse.flags.read(ablation.Options, shlex.split(flags))
-        sweep = ablation.make_sweep(weight.ABLATION, options, ROOT / "experiments")
+        sweep = ablation.make_sweep(weight.ABLATION, options)
         folders = {str(runs.folder(sweep, own)) for own in runs.all_runs(sweep)}
         words = re.findall(rf"\${variable}(-\S+)", guide)
         assert len(words) >= 4

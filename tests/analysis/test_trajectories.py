@@ -13,7 +13,6 @@ from refusals import refused
 from vawm.analysis import movies, trajectories
 from vawm.analysis.trajectories import Trajectories
 from vawm.losses.transforms import symlog
-from vawm.runs.runner import RunError
 
 
 @pytest.fixture(
@@ -85,7 +84,7 @@ def test_a_film_is_written_and_read_again(tmp_path):
 
 def test_a_missing_encoder_is_one_line(monkeypatch, tmp_path):
     monkeypatch.setattr(movies.importlib.util, "find_spec", lambda _: None)
-    with pytest.raises(RunError, match=r"^imageio .*vawm\[analysis\]"):
+    with refused("imageio", naming="vawm[analysis]"):
         movies.write_mp4(np.zeros((1, 4, 4, 3), np.uint8), tmp_path / "a.mp4")
 
 

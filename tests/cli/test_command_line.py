@@ -14,7 +14,7 @@ from vawm.agent import with_size
 from vawm.cli import command_line
 from vawm.errors import InvalidInput
 from vawm.process import cache
-from vawm.runs import checkpoint, run_folder, runner
+from vawm.runs import checkpoint, run_folder, runner, suites
 
 EXPERIMENT = pathlib.Path(__file__).parents[2] / "experiments" / "dmc_proprio.py"
 
@@ -132,6 +132,21 @@ def test_a_run_gets_a_folder_of_its_own():
         (["--logdir", "."], "logdir='.': "),
         (["--logdir", "file/run"], "logdir='file/run': "),
         (["--env-step", "5"], "--env-step='5': .*--env-steps"),
+        (["--env-steps", "1.5e0"], "--env-steps='1.5e0': use a whole number"),
+        (["--env-steps", "1e-3"], "--env-steps='1e-3': use a whole number"),
+        (["--lr", "1e-4"], "--lr='1e-4': .*'--optimizer.learning-rate'"),
+        (["--seeds", "0", "1"], "--seeds='0 1': .*'--seed'"),
+        (["--steps", "5"], "--steps='5': .*'--env-steps'"),
+        (["--total-timesteps=5"], "--total-timesteps='5': .*'--env-steps'"),
+        (["--env", "Pong"], "--env='Pong': .*'--task'"),
+        (["--game", "pong"], "--game='pong': .*'--task'"),
+        (["--batch-size", "8"], "--batch-size='8': .*'--replay.batch-size'"),
+        (["--device", "cuda"], "--device='cuda': .*JAX_PLATFORMS"),
+        (["--value-alignment.weight", "none"], ".*'none': did you mean 'off'"),
+        (["--value-alignment.weight=0"], ".*'0': did you mean 'off'"),
+        (["--tracker", "off"], ".*'off': did you mean 'none'"),
+        (["--task", "walker_wlak", "--env-steps", "0"], "task='walker_wlak': .*'walker_walk'"),
+        (["--critic.units", "x", "--task", "walker_wlak"], "task='walker_wlak': "),
         (["--seed", "x"], "--seed='x': "),
         (["stray"], "argument='stray': "),
         (["--resume=yes"], "--resume=True: "),
@@ -286,6 +301,27 @@ def test_what_goes_wrong_is_one_line(capsys, error, code):
 
     assert command_line.guard(fail) == code
     assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.parametrize("length", ["240000", "240_000", "2.4e5", "24e4", "2.4E+05"])
+def test_whole_numbers_may_be_written_in_other_ways(length):
+    config = parse("--env-steps", length, "--replay.capacity=1e6").config
+    assert (config.env_steps, config.replay.capacity) == (240_000, 1_000_000)
+    assert config.value_alignment.warmup_steps == 2 * 7_200
+    assert parse("--optimizer.learning-rate", "1e-3").config.optimizer.learning_rate == 1e-3
+
+
+@pytest.mark.parametrize("suite", suites.SUITES)
+def test_the_help_says_first_what_matters_most(suite, capsys):
+    with pytest.raises(SystemExit, match="0"):
+        command_line.parse(["--help"], suite=suite, command=f"vawm train {suite}")
+    text = capsys.readouterr().out
+    assert f"usage: vawm train {suite} " in text
+    assert suites.SUITES[suite].title in " ".join(text.split())
+    text = text.partition("The flags that matter most:")[2]
+    places = [text.index(flag) for flag in command_line.FIRST]
+    assert places == sorted(places)
+    assert max(places) < text.index("--help ")
 
 
 def test_starting_over_is_a_flag_and_not_the_usual():

@@ -73,9 +73,54 @@ def test_an_error_names_flag_value_and_remedy(argv, message, capsys):
     assert not output.out + output.err
 
 
+@pytest.mark.parametrize(
+    ("word", "number"),
+    [("1e6", "1000000"), ("2.5e3", "2500"), ("1_0e2", "1000"), ("-2E+1", "-20")],
+)
+def test_a_whole_number_in_other_words(word, number):
+    assert flags.whole(word) == number
+
+
+@pytest.mark.parametrize("word", ["1.5e0", "1e-3", "1__0e3", "1e", "e5", "x", "1e999", "7", ""])
+def test_other_words_stay_as_they_are(word):
+    assert flags.whole(word) == word
+
+
+def test_only_whole_numbers_are_rewritten():
+    options = read(
+        "--name", "1e3", "--inner.rate_", "1e3", "--seeds", "1e1", "2", "--length=3e0"
+    )
+    assert options == Options("1e3", length=3, seeds=(10, 2), inner=Inner(1e3))
+
+
+@dataclasses.dataclass(frozen=True)
+class Outer(Options):
+    batch_size: int = 2
+    """sequences
+    in a batch"""
+    seed: int = 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Further(Outer):
+    batch_size: int = 3
+
+
+def test_the_sentence_of_a_flag_is_the_string_below_its_field():
+    said = flags.sentences(Further)
+    assert said.keys() == flags.known(Further).keys()
+    assert {flag: text for flag, text in said.items() if text} == {
+        "--batch-size": "sequences in a batch"
+    }
+
+
 def test_a_flag_without_a_default_is_required():
     with pytest.raises(InvalidInput, match="--name=None: is required"):
         flags.read(Options, [])
+    with pytest.raises(InvalidInput, match="--name=None: is required"):
+        flags.read(Options, ["--no-deep", "--length", "3"])
+    with pytest.raises(InvalidInput, match="--nane='x': no such flag; did you mean '--name'"):
+        flags.read(Options, ["--deep", "--nane", "x"])
 
 
 def test_help_is_the_one_of_tyro(capsys):

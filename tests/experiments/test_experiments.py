@@ -12,6 +12,7 @@ import tiny_storm
 from vawm.agent import make_agent
 from vawm.cli import command_line
 from vawm.runs import run_folder
+from vawm.sweep import learning_curves as curves
 from vawm.types import EnvSpec, image
 
 FOLDER = pathlib.Path(__file__).parents[2] / "experiments"
@@ -25,8 +26,7 @@ def load(name):
     return module
 
 
-benchmark, curves = load("benchmark"), load("learning_curves")
-gradient_routes = load("gradient_routes")
+benchmark, gradient_routes = load("benchmark"), load("gradient_routes")
 
 
 @pytest.mark.parametrize(
@@ -47,7 +47,13 @@ gradient_routes = load("gradient_routes")
         (curves, ["--tasks", "walker_wlak"], "task='walker_wlak': did you mean"),
         (curves, ["--alignments", "of"], "alignments='of': did you mean 'off'"),
         (curves, ["--preset", "quik"], "preset='quik': did you mean 'quick'"),
-        (curves, ["--experiment", "gymnasium"], "experiment='gymnasium': "),
+        (
+            curves,
+            ["--experiment", "gymnasum"],
+            "experiment='gymnasum': did you mean 'gymn",
+        ),
+        (curves, ["--experiment", "gymnasium", "--tasks", "all"], "tasks='all': "),
+        (curves, ["--env-steps", "7_999"], "env_steps=7999: "),
         (curves, ["--jobs", "0"], "jobs=0: use a whole number"),
         (curves, ["--env-steps", "0"], "env_steps=0: use a number above 0"),
         (curves, ["--seeds", "a"], "--seeds='a': use a whole number"),
@@ -136,9 +142,9 @@ def words(options):
 def test_the_command_of_a_run_says_all_of_it(options):
     sweep = curves.make_sweep(dataclasses.replace(options, env_steps=97))
     (run,) = curves.runs.all_runs(sweep)
-    python, program, *flags = curves.runs.command(sweep, run)
-    assert python == sys.executable
-    assert program == str(FOLDER / "dmc_proprio.py")
+    words = curves.runs.command(sweep, run)
+    program, flags = words[:5], words[5:]
+    assert program == [sys.executable, "-m", "vawm", "train", "dmc_proprio"]
     assert dict(zip(flags[::2], flags[1::2], strict=True)) == {
         "--agent": "dreamerv3",
         "--task": "cartpole_balance",
@@ -190,7 +196,7 @@ def test_a_missing_matplotlib_is_reported_before_training(options, monkeypatch, 
         curves.runs.analysis_figures.importlib.util, "find_spec", lambda _: None
     )
     monkeypatch.setattr(curves.children, "run", None)
-    assert command_line.guard(lambda: curves.main(words(options))) == 1
+    assert command_line.guard(lambda: curves.main(words(options))) == 2
     told = capsys.readouterr().err
     assert "matplotlib" in told
     assert "pip install" in told

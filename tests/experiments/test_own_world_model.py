@@ -123,7 +123,7 @@ def test_it_is_analysed(logdir):
 
 def test_sweeps_know_it(tmp_path):
     sweep = Sweep(
-        program=FOLDER / "dmc_proprio.py",
+        program=runs.trains("dmc_proprio"),
         folder=tmp_path,
         variants=(Variant("off", ("--value-alignment.weight", "off")),),
         tasks=("cartpole_balance",),

@@ -84,7 +84,12 @@ from vawm.cli.command_line import guard
 from vawm.sweep import children
 
 jobs = [
-    children.Job(f"job {i}", [sys.executable, "-c", f"print({i})"], pathlib.Path(f"log{i}"))
+    children.Job(
+        f"job {i}",
+        [sys.executable, "-c", f"print({i})"],
+        log=pathlib.Path(f"log{i}"),
+        folder=pathlib.Path(f"run{i}"),
+    )
     for i in range(3)
 ]
 sys.exit(guard(lambda: children.run_then(jobs, lambda: print("done"), at_once=1)))

@@ -24,9 +24,20 @@ def test_a_new_or_empty_folder_is_accepted_and_not_made(tmp_path):
 
 
 def test_a_folder_that_holds_something_is_refused(tmp_path):
-    (tmp_path / "file").touch()
+    run_folder.write_config(tmp_path, tiny.CONFIG)
     with refused("logdir", str(tmp_path), naming=["--resume", "--fresh", "--logdir"]):
         run_folder.check_new(tmp_path)
+    run_folder.put_aside(tmp_path)
+    with refused("logdir", str(tmp_path), naming=["--fresh", "--logdir"]) as refusal:
+        run_folder.check_new(tmp_path)
+    assert "--resume" not in refusal.value.remedy
+
+
+def test_what_a_folder_without_a_run_cannot_do_is_not_suggested(tmp_path):
+    (tmp_path / "thesis.tex").touch()
+    with refused("logdir", str(tmp_path), naming="--logdir") as refusal:
+        run_folder.check_new(tmp_path)
+    assert not {"--resume", "--fresh"} & set(refusal.value.remedy.replace(",", "").split())
 
 
 def test_a_folder_with_only_a_lock_counts_as_empty(tmp_path):

@@ -110,6 +110,19 @@ def test_bad_input_is_one_line_and_code_2(experiment, suite, flags, message, cap
     assert not list(pathlib.Path().iterdir())
 
 
+def test_a_wrong_task_is_told_before_wrong_numbers(tmp_path):
+    def check(task):
+        config = dataclasses.replace(presets.QUICK, task=task, env_steps=0)
+        runner.check(config, tmp_path, resume=False)
+
+    with refused("task", "walker_wlak", naming="'walker_walk'"):
+        check("walker_wlak")
+    with refused("task", 3):
+        check(3)
+    with refused("env_steps", 0):
+        check("walker_walk")
+
+
 def test_remedies_name_fields_in_python_and_flags_on_the_command_line(capsys):
     """A problem of the look, with the setting that ends it."""
     env = dataclasses.replace(presets.GYMNASIUM_QUICK.env, workers=1)
@@ -192,7 +205,7 @@ def test_only_records_and_presets_know_one_suite_from_another():
     classes = {"AtariConfig", "VisionConfig", "GymnasiumConfig"}
     for path in PACKAGE.rglob("*.py"):
         name = path.relative_to(PACKAGE).as_posix()
-        if name in ("config.py", "presets.py") or name.startswith("runs/suites/"):
+        if name.startswith(("config/", "runs/suites/")):
             continue
         nodes = list(ast.walk(ast.parse(path.read_text())))
         assert not classes & {node.id for node in nodes if isinstance(node, ast.Name)}, name

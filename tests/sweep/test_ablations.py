@@ -15,7 +15,6 @@ from vawm.errors import InvalidInput
 from vawm.sweep import ablation, children, overhead, runs
 
 FOLDER = pathlib.Path(__file__).parents[2] / "experiments" / "ablations"
-PROGRAMS = FOLDER.parent
 
 
 def load(path):
@@ -60,7 +59,7 @@ def test_every_script_has_an_ablation():
 
 def make(name, scale, agent="dreamerv3", **changes):
     options = ablation.Options(scale=scale, agent=agent, **changes)
-    return options, ablation.make_sweep(ABLATIONS[name], options, PROGRAMS)
+    return options, ablation.make_sweep(ABLATIONS[name], options)
 
 
 def test_without_metrics_earlier_results_are_kept(tmp_path, capsys):
@@ -249,7 +248,7 @@ def test_an_ablation_runs_from_end_to_end(tmp_path, capsys):
     assert last["independent"] != last["shared"]
     for name in ("ablation_noise.png", "ablation_noise_curves.png"):
         assert (tmp_path / "results" / name).stat().st_size
-    sweep = ablation.make_sweep(small, options, PROGRAMS)
+    sweep = ablation.make_sweep(small, options)
     assert not runs.unfinished_jobs(sweep)
     ablation.check(small, options, sweep)
     longer = dataclasses.replace(options, env_steps=256)

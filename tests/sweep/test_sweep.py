@@ -1,5 +1,6 @@
 """Sweeps over a program that does not train: starting, stopping, reading and writing."""
 
+import json
 import os
 import pathlib
 import signal
@@ -16,7 +17,16 @@ from refusals import refused
 from vawm.analysis import tables
 from vawm.runs import run_folder, suites
 from vawm.runs.runner import RunError
-from vawm.sweep import children, figures, results, runs
+from vawm.sweep import (
+    ablation,
+    children,
+    costs,
+    figures,
+    learning_curves,
+    progress,
+    results,
+    runs,
+)
 from vawm.sweep.runs import Run, Sweep, Variant
 
 # Takes the flags of a training program, and `--behave`: it writes the files of a run, then
@@ -62,7 +72,7 @@ def make_sweep(folder, *behaviours, **changes):
     run_folder.write_config(folder, tiny.CONFIG)
     variants = tuple(Variant(name, ("--behave", name)) for name in behaviours)
     given = {"variants": variants, "tasks": ("a/b",), "seeds": (0, 1)} | changes
-    return Sweep(program=program, folder=folder / "runs", **given)
+    return Sweep(program=(sys.executable, str(program)), folder=folder / "runs", **given)
 
 
 def log(sweep, run):
@@ -107,6 +117,39 @@ def test_finished_runs_are_skipped_and_started_runs_are_resumed(tmp_path):
     assert not runs.unfinished_jobs(sweep)
     longer = runs.dataclasses.replace(sweep, env_steps=97)
     assert len(runs.unfinished_jobs(longer)) == 3
+
+
+def test_progress_tells_counts_scores_and_the_time_left(tmp_path):
+    folders = [tmp_path / name for name in ("a", "b", "c")]
+    now, said = [0.0], []
+
+    def reach(folder, env_steps, value):
+        folder.mkdir(exist_ok=True)
+        run_folder.write_config(folder, tiny.config(env_steps=100))
+        line = {"env_steps": env_steps, "episode/return": value}
+        with (folder / "metrics.jsonl").open("a") as file:
+            file.write(json.dumps(line) + "\n")
+
+    reach(folders[0], 50, 1.0)  # in an earlier sweep
+    watch = progress.Progress(folders, say=said.append, clock=lambda: now[0])
+    watch.starts("a", folders[0])
+    assert said == ["[0 of 3 finished, 1 running, ? left] a: started"]
+    now[0] = 3600.0
+    reach(folders[0], 100, 2.0)
+    watch.ends("a", folders[0], 0)  # half a run an hour, and two are to do
+    finished = "[1 of 3 finished, 0 running, 4:00 h left] a: finished"
+    assert said[1] == f"{finished}, return 2.0 at 100 env steps"
+    watch.starts("b", folders[1])
+    watch.look()  # nothing new
+    now[0] = 7200.0
+    reach(folders[1], 50, None)
+    watch.look()
+    counts = "[1 of 3 finished, 1 running, 3:00 h left]"
+    assert said[3:] == [f"{counts} b: no return yet at 50 env steps"]
+    watch.ends("b", folders[1], 7)  # what it lacks is not done
+    counts = "[1 of 3 finished, 0 running, 1 failed, 2:00 h left]"
+    text = f"{counts} b: failed with exit code 7, no return yet at 50 env steps"
+    assert said[4:] == [text]
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
@@ -321,6 +364,40 @@ def test_options_that_every_run_would_refuse_are_refused_at_once(
     given = {"tasks": ("walker_run",), "variants": (Variant("plain", ()),)} | changes
     with refused(field, value, naming=named):
         runs.check(make_sweep(tmp_path, **given), "dmc_proprio")
+
+
+EPISODES = "--num-envs", "8", "--replay.batch-size", "2", "--replay.batch-length", "8"
+
+
+def test_a_sweep_in_which_no_episode_can_end_is_refused(tmp_path):
+    given = QUICK | {"flags": EPISODES}
+    runs.check(make_sweep(tmp_path, **given, env_steps=8_000), "dmc_proprio")
+    with refused("env_steps", 7_999, naming="8000"):
+        runs.check(make_sweep(tmp_path, **given, env_steps=7_999), "dmc_proprio")
+
+
+def test_episodes_of_unknown_length_may_end_at_any_time(tmp_path):
+    given = QUICK | {"tasks": ("CartPole-v1",), "flags": EPISODES}
+    runs.check(make_sweep(tmp_path, **given, env_steps=200), "gymnasium")
+
+
+@pytest.mark.parametrize("suite", ["dmc_proprio", "dmc_vision", "atari100k"])
+def test_all_stands_for_all_tasks_of_a_suite(suite):
+    tasks = runs.named_tasks(suite, ("all",))
+    assert len(set(tasks)) == {"dmc_proprio": 18, "dmc_vision": 20, "atari100k": 26}[suite]
+    for task in tasks:
+        suites.SUITES[suite].check_task(task)
+    assert runs.named_tasks(suite, ("a", "b")) == ("a", "b")
+
+
+def test_all_tasks_of_a_suite_that_cannot_list_them_are_refused():
+    with refused("tasks", "all"):
+        runs.named_tasks("gymnasium", ("all",))
+
+
+def test_sweeps_write_to_a_folder_of_their_own():
+    for options in (learning_curves.Options(), ablation.Options(), costs.Options()):
+        assert options.results.parts[0] == "runs"
 
 
 QUICK = {"tasks": ("walker_run",), "variants": (Variant("plain", ()),)}

@@ -10,7 +10,7 @@ import tiny_storm
 from nets_twin import noisy
 
 from vawm.agent import make_agent, parameter_count
-from vawm.presets import STORM, STORM_QUICK
+from vawm.config.presets import STORM, STORM_QUICK
 from vawm.types import EnvSpec, image, vector
 from vawm.world_model.storm import storm
 from vawm.world_model.window import Window, remember

@@ -6,7 +6,7 @@ import functools
 from collections.abc import Sequence
 from typing import cast
 
-from vawm import config, nets, presets
+from vawm import config, nets
 from vawm.agent.actor_critic import Critic
 from vawm.agent.agent import LatentLosses
 from vawm.agent.registry import Activations, register
@@ -17,6 +17,7 @@ from vawm.config import (
     RSSMConfig,
     StormConfig,
     VagramConfig,
+    presets,
 )
 from vawm.errors import BELOW_ONE, LAYERS, NOT_NEGATIVE, InvalidInput
 from vawm.world_model.rssm import rssm

@@ -22,7 +22,6 @@ import typing
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-from vawm import presets
 from vawm.agent import plugins
 from vawm.config import (
     CUSTOM,
@@ -31,6 +30,7 @@ from vawm.config import (
     OptimizerConfig,
     WorldModelConfig,
     kinds,
+    presets,
     with_widths,
 )
 from vawm.errors import InvalidInput, Rule

@@ -8,6 +8,7 @@
     vawm.analysis.curves         losses and weights over a training, several runs together
     vawm.analysis.tables         CSV and JSON
     vawm.analysis.figures, vawm.analysis.movies   pictures; they need the extra `analysis`
+    vawm.analysis.program        the command line, `vawm analyse`
 
-All other modules compute numbers. `experiments/analyse.py` is the command line.
+All other modules compute numbers.
 """

@@ -16,8 +16,8 @@ from vawm.analysis.curves import METRICS, Curves
 from vawm.analysis.saliency import Look
 from vawm.analysis.trajectories import Trajectories, vectors
 from vawm.analysis.values import MEASURES, Group, Report
+from vawm.errors import InvalidInput
 from vawm.runs.reports import video
-from vawm.runs.runner import RunError
 
 DPI = 110
 COLUMNS = 12  # of a strip, at most
@@ -46,10 +46,10 @@ def check() -> None:
     """Checks that matplotlib is installed.
 
     Raises:
-      RunError: names the package and the command that installs it.
+      InvalidInput: names the package and the command that installs it.
     """
     if importlib.util.find_spec("matplotlib") is None:
-        raise RunError("matplotlib is not installed: pip install 'vawm[analysis]'")
+        raise InvalidInput("matplotlib", "not installed", "pip install 'vawm[analysis]'")
 
 
 def plain(name: str) -> str:

@@ -9,8 +9,8 @@ import warnings
 import numpy as np
 from PIL import Image
 
+from vawm.errors import InvalidInput
 from vawm.runs.reports.video import FRAMES_PER_SECOND
-from vawm.runs.runner import RunError
 
 PACKAGES = {"imageio": "imageio", "imageio_ffmpeg": "imageio-ffmpeg"}
 
@@ -19,11 +19,11 @@ def check() -> None:
     """Checks that the packages for films are installed.
 
     Raises:
-      RunError: names the package and the command that installs it.
+      InvalidInput: names the package and the command that installs it.
     """
     for module, package in PACKAGES.items():
         if importlib.util.find_spec(module) is None:
-            raise RunError(f"{package} is not installed: pip install 'vawm[analysis]'")
+            raise InvalidInput(package, "not installed", "pip install 'vawm[analysis]'")
 
 
 def write_mp4(
@@ -38,7 +38,7 @@ def write_mp4(
     Odd sides are padded by repeating the last row or column, because the codec needs even ones.
 
     Raises:
-      RunError: a package is not installed.
+      InvalidInput: a package is not installed.
       OSError: the file could not be written.
     """
     check()

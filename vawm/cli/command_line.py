@@ -24,9 +24,23 @@ from vawm.config import CUSTOM, AgentName, Config
 from vawm.envs.protocol import EnvironmentFailure
 from vawm.errors import InvalidInput
 from vawm.process import cache, names, streams
-from vawm.runs import resume, runner, validate
+from vawm.runs import resume, runner, suites, validate
 from vawm.runs.checkpoint import SaveError
 from vawm.runs.runner import RunError
+
+FIRST = (
+    "--task",
+    "--agent",
+    "--preset",
+    "--size",
+    "--seed",
+    "--env-steps",
+    "--num-envs",
+    "--logdir",
+    "--resume",
+    "--value-alignment.weight",
+)
+"""The flags that matter most, in the order of the help."""
 
 
 class Arguments(NamedTuple):
@@ -55,17 +69,20 @@ def train(
     argv: Sequence[str] | None,
     *,
     suite: str,
-    description: str,
+    description: str | None = None,
     agent: AgentName = "dreamerv3",
     task: str | None = None,
-    aliases: Mapping[str, str] | None = None,
+    command: str | None = None,
 ) -> int:
-    """What an experiment does: reads its command line and trains; returns the exit code.
+    """Reads a command line and trains; returns the exit code.
 
-    The arguments are those of `parse`.
+    Args:
+      argv, suite, description, agent, task: as for `parse`.
+      command: what the user has typed before `argv`, for help and advice; the file of the
+        process if None.
     """
     arguments = parse(
-        argv, suite=suite, description=description, agent=agent, task=task, aliases=aliases
+        argv, suite=suite, description=description, agent=agent, task=task, command=command
     )
     config, logdir = arguments.config, arguments.logdir
     runner.check(config, logdir, resume=arguments.resume, fresh=arguments.fresh)
@@ -76,7 +93,7 @@ def train(
         resume=arguments.resume,
         fresh=arguments.fresh,
         banner=describe(config),
-        command=f"python {names.quoted(pathlib.Path(sys.argv[0]))}",
+        command=command or f"python {names.quoted(pathlib.Path(sys.argv[0]))}",
     )
     return result.exit_code
 
@@ -85,22 +102,22 @@ def parse(
     argv: Sequence[str] | None,
     *,
     suite: str,
-    description: str,
+    description: str | None = None,
     agent: AgentName = "dreamerv3",
     preset: str = "quick",
     task: str | None = None,
-    aliases: Mapping[str, str] | None = None,
+    command: str | None = None,
 ) -> Arguments:
     """Reads `argv` (of the process if None).
 
     Args:
       argv: the words after the program's name.
       suite: whose presets there are to choose from.
-      description: for the help.
+      description: for the help; as the suite's record says if None.
       agent: the default one.
       preset: the default one.
       task: the default one; that of the preset if None.
-      aliases: flag -> the flag that it stands for.
+      command: what the user has typed before `argv`, for the help.
 
     Raises:
       InvalidInput: an unknown preset, size or flag, a wrong type, nothing to resume, or a
@@ -108,9 +125,12 @@ def parse(
       SystemExit: help was asked for (0).
     """
     argv = flags.load_plugins(list(sys.argv[1:] if argv is None else argv))
-    argv = [_without_alias(word, aliases or {}) for word in argv]
+    argv = [_without_alias(word, suites.SUITES[suite].aliases) for word in argv]
     default = Flags(_defaults(argv, suite, agent, preset, task))
-    given = flags.read(Flags, argv, default=default, description=description)
+    if description is None:
+        description = describe_suite(suite, command or "")
+    told = f"{description.rstrip()}\n\n{_first_flags(default)}" if _asks_help(argv) else ""
+    given = flags.read(Flags, argv, default=default, description=told, prog=command)
     if given.fresh and given.logdir is None:
         raise InvalidInput("logdir", None, "--fresh needs the --logdir to start over in")
     config = _with_its_size(given.config)
@@ -119,6 +139,30 @@ def parse(
         raise InvalidInput("suite", config.suite, remedy)
     logdir = given.logdir or default_logdir(config)
     return Arguments(config, logdir, given.resume, given.fresh)
+
+
+def describe_suite(suite: str, command: str) -> str:
+    """The help of the program of a suite: what it trains on, with examples."""
+    record = suites.SUITES[suite]
+    agents = ", ".join(registry.names())
+    lines = [f"Train an agent ({agents}) on {record.title}.", ""]
+    width = max(map(len, record.examples), default=0)
+    for words, what in record.examples.items():
+        lines.append(f"    {command} {words:{width}}  # {what}")
+    lines += ["", *([record.notes, ""] if record.notes else [])]
+    return "\n".join([*lines, "Every choice is a flag."])
+
+
+def _first_flags(default: Flags) -> str:
+    """The part of the help with the flags that matter most."""
+    said = flags.sentences(Flags, default)
+    width = max(map(len, FIRST))
+    lines = [f"    {flag:{width}}  {said[flag].partition(';')[0]}" for flag in FIRST]
+    return "\n".join(["The flags that matter most:", "", *lines])
+
+
+def _asks_help(argv: Sequence[str]) -> bool:
+    return not {"-h", "--help"}.isdisjoint(argv)
 
 
 def _without_alias(word: str, aliases: Mapping[str, str]) -> str:
@@ -132,6 +176,7 @@ def _defaults(
 ) -> Config:
     """First phase: the config that the flags of the second override."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    parser.add_argument("--task", nargs="?")
     parser.add_argument("--agent", nargs="?")
     parser.add_argument("--preset", nargs="?")
     parser.add_argument("--size", nargs="?")
@@ -142,7 +187,9 @@ def _defaults(
         known, _ = parser.parse_known_args(argv)
     except argparse.ArgumentError:  # --resume=value
         raise InvalidInput("--resume", True, "takes no value; write --resume alone") from None
-    if not known.resume or {"-h", "--help"} & set(argv):
+    if not known.resume or _asks_help(argv):
+        if known.task is not None and not _asks_help(argv):
+            suites.SUITES[suite].check_task(known.task)  # before any number
         size = None if known.size == CUSTOM else known.size
         chosen = known.agent or agent
         config = validate.preset(chosen, suite, known.preset or preset, size)
@@ -163,7 +210,7 @@ def _defaults(
 def _with_its_warmup(config: Config, env_steps: str | None) -> Config:
     """`config`; of a small preset, with the warm-up for a run of the length that was given."""
     try:
-        length = int(env_steps or "")
+        length = int(flags.whole(env_steps or ""))
     except ValueError:  # none, or one that the second phase refuses
         return config
     if not is_small(config):

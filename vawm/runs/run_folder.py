@@ -36,10 +36,16 @@ def check_new(logdir: pathlib.Path) -> None:
       InvalidInput: it is not writable or not empty.
     """
     check_writable(logdir)
-    if logdir.is_dir() and any(path.name != LOCK for path in logdir.iterdir()):
-        others = "start over with --fresh or choose another --logdir"
+    if not logdir.is_dir() or all(path.name == LOCK for path in logdir.iterdir()):
+        return
+    others = "start over with --fresh or choose another --logdir"
+    if _has_checkpoints(logdir) or _content(logdir / CONFIG):
         remedy = f"already exists; continue that run with --resume, {others}"
-        raise InvalidInput("logdir", str(logdir), remedy)
+    elif may_start_over(logdir):
+        remedy = f"holds a run that was put aside; {others}"
+    else:
+        remedy = "contains files, but no run; choose another --logdir"
+    raise InvalidInput("logdir", str(logdir), remedy)
 
 
 def check_writable(folder: pathlib.Path, name: str = "logdir") -> None:
@@ -85,15 +91,23 @@ def check_fresh(logdir: pathlib.Path) -> None:
       InvalidInput: `put_aside` would move files that this package did not write.
     """
     check_writable(logdir)
+    if not may_start_over(logdir):
+        remedy = "contains files, but no run to start over; choose another --logdir"
+        raise InvalidInput("logdir", str(logdir), remedy)
+
+
+def may_start_over(logdir: pathlib.Path) -> bool:
+    """Whether `put_aside` would move only files that this package has written."""
     names = [path.name for path in logdir.iterdir()] if logdir.is_dir() else []
     ours = rf"{LOCK}|{re.escape(CONFIG)}\.tmp|{REPLACED}\d+"
     others = [name for name in names if not re.fullmatch(ours, name)]
-    saved = any(logdir.glob(f"checkpoints/{'[0-9]' * 12}"))
     # In `replaced-*` if an earlier `put_aside` was interrupted.
     begun = [logdir / CONFIG, *logdir.glob(f"{REPLACED}*/{CONFIG}")]
-    if others and not saved and not any(map(_content, begun)):
-        remedy = "contains files, but no run to start over; choose another --logdir"
-        raise InvalidInput("logdir", str(logdir), remedy)
+    return not others or _has_checkpoints(logdir) or any(map(_content, begun))
+
+
+def _has_checkpoints(logdir: pathlib.Path) -> bool:
+    return any(logdir.glob(f"checkpoints/{'[0-9]' * 12}"))
 
 
 @contextlib.contextmanager

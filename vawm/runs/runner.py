@@ -212,10 +212,10 @@ def check(
       InvalidInput: names field, value and remedy.
     """
     settings.check_training()
+    if known_task and not resume:  # a wrong name first: numbers depend on what it stands for
+        validate.check_task(config)
     validate.check(config)
     logdir = checkpoint.expanded(logdir)
-    if known_task and not resume:
-        suites.check_task(config)
     if not resume:  # a resumed run continues even without its tracker
         backends.check(config)
     if resume and fresh:

@@ -11,9 +11,8 @@ from typing import Any
 
 import jax
 
-from vawm import presets
 from vawm.agent import registry
-from vawm.config import CUSTOM, Config, kinds
+from vawm.config import CUSTOM, Config, kinds, presets
 from vawm.errors import (
     ABOVE_ONE,
     BELOW_ONE,
@@ -95,6 +94,18 @@ def check(config: Config) -> None:
         elif isinstance(kind, type) and not isinstance(value, kind):
             raise InvalidInput(name, value, f"use {KINDS.get(kind, kind.__name__)}")
     _check_together(config)
+
+
+def check_task(config: Config) -> None:
+    """Checks the suite and its task, and no number.
+
+    Raises:
+      InvalidInput: names what is unknown, and the nearest one.
+    """
+    check_choice("suite", config.suite, list(suites.SUITES))
+    if not isinstance(config.task, str):
+        raise InvalidInput("task", config.task, f"use {KINDS[str]}")
+    suites.check_task(config)
 
 
 def check_choice(name: str, value: Any, choices: Collection[str]) -> None:

@@ -17,7 +17,7 @@ from vawm.agent import registry
 from vawm.analysis.tables import write_csv
 from vawm.cli import flags
 from vawm.config import AgentName
-from vawm.runs import suites, validate
+from vawm.runs import validate
 from vawm.sweep import children, figures, results, runs
 from vawm.sweep.runs import Sweep, Variant
 
@@ -94,9 +94,11 @@ class Compared:
     scale: Literal["quick", "paper"] = "quick"
     """quick: for a CPU with 2 cores; paper: the paper's tasks and presets, for a GPU"""
     agent: AgentName = "dreamerv3"
+    """which agent"""
     tasks: tuple[str, ...] = ()
-    """one or more tasks; default those of the scale"""
-    results: pathlib.Path = pathlib.Path("experiments/results")
+    """one or more tasks, or all; default those of the scale"""
+    results: pathlib.Path = pathlib.Path("runs/ablations/results")
+    """folder of tables and figures; existing ones are overwritten"""
 
 
 @dataclass(frozen=True)
@@ -104,12 +106,13 @@ class Options(Compared):
     """The runs of an ablation, and their folder."""
 
     seeds: tuple[int, ...] = ()
-    """default those of the scale"""
+    """one run of each task and variant for every seed; default those of the scale"""
     env_steps: int | None = None
     """length of every run; default that of the scale"""
     jobs: int = 1
     """runs at the same time"""
     runs: pathlib.Path = pathlib.Path("runs/ablations")
+    """folder of the runs"""
     collect_only: bool = False
     """write the results of existing runs, and start none"""
 
@@ -118,19 +121,8 @@ def main(
     ablation: Ablation, argv: Sequence[str] | None, *, description: str | None, script: str
 ) -> int:
     """The main function of a script for `ablation`; returns 1 if a run failed, else 0."""
-    default = Options(results=results_folder(script))
-    options = flags.read(Options, argv, default=default, description=description)
+    options = flags.read(Options, argv, description=description)
     return run(ablation, options, script=script)
-
-
-def results_folder(script: str) -> pathlib.Path:
-    """The folder of results, next to the script's folder."""
-    return programs_folder(script) / "results"
-
-
-def programs_folder(script: str) -> pathlib.Path:
-    """The folder of the programs that train, above the script's folder."""
-    return pathlib.Path(script).resolve().parents[1]
 
 
 def run(ablation: Ablation, options: Options, *, script: str) -> int:
@@ -143,9 +135,9 @@ def run(ablation: Ablation, options: Options, *, script: str) -> int:
 
     Raises:
       InvalidInput: before anything is started.
-      RunError: matplotlib is not installed, or no run has any metrics.
+      RunError: no run has any metrics.
     """
-    sweep = make_sweep(ablation, options, programs_folder(script))
+    sweep = make_sweep(ablation, options)
     check(ablation, options, sweep)
 
     def report() -> None:
@@ -159,7 +151,7 @@ def scale_of(ablation: Ablation, options: Compared) -> Scale:
     return {"quick": ablation.quick, "paper": ablation.paper}[options.scale]
 
 
-def make_sweep(ablation: Ablation, options: Options, programs: pathlib.Path) -> Sweep:
+def make_sweep(ablation: Ablation, options: Options) -> Sweep:
     """The runs of an ablation.
 
     Raises:
@@ -168,10 +160,10 @@ def make_sweep(ablation: Ablation, options: Options, programs: pathlib.Path) -> 
     scale = scale_of(ablation, options)
     validate.check_choice("agent", options.agent, registry.names())
     return Sweep(
-        program=programs / suites.SUITES[scale.suite].program,
+        program=runs.trains(scale.suite),
         folder=options.runs / result_name(ablation, options),
         variants=ablation.variants(options.agent),
-        tasks=options.tasks or scale.tasks,
+        tasks=runs.named_tasks(scale.suite, options.tasks) or scale.tasks,
         seeds=options.seeds or scale.seeds,
         flags=("--agent", options.agent, "--preset", scale.preset, *scale.flags),
         env_steps=options.env_steps if options.env_steps is not None else scale.env_steps,
@@ -239,7 +231,7 @@ def setting(agent: str, sweep: Sweep) -> str:
         agent += " unless stated"
     length = "" if sweep.env_steps is None else f", {sweep.env_steps:,} environment steps"
     preset = sweep.flags[sweep.flags.index("--preset") + 1]
-    return f"Agent {agent}, preset {preset} of {sweep.program.name}{length}."
+    return f"Agent {agent}, preset {preset} of {sweep.program[-1]}{length}."
 
 
 def command(options: Compared, script: str) -> str:

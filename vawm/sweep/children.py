@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import pathlib
 import subprocess
@@ -12,6 +13,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from vawm.process import signals
+from vawm.sweep.progress import Progress
 
 POLL_SECONDS = 0.1
 """Well below `signals.BURST_SECONDS`: then a child that already got Ctrl-C from a terminal
@@ -19,11 +21,12 @@ counts the SIGTERM from this process as the same request."""
 
 
 class Job(NamedTuple):
-    """A command, and the file to which its output is appended."""
+    """A command that trains, the file to which its output is appended, and the run's folder."""
 
     name: str
     command: Sequence[str]
     log: pathlib.Path
+    folder: pathlib.Path
 
 
 class Outcome(NamedTuple):
@@ -41,6 +44,8 @@ class Outcome(NamedTuple):
 def run(jobs: Sequence[Job], *, at_once: int) -> Outcome:
     """Runs `at_once` jobs at a time, on Linux each on its share of the cores.
 
+    Prints a line when a run starts, when it ends, and every minute for new scores.
+
     After Ctrl-C, SIGTERM or SIGHUP it starts no further job and sends SIGTERM to the running
     ones, which makes a run save and stop. It returns when all have ended. A second signal
     ends this process at once, while the jobs continue to save.
@@ -49,14 +54,17 @@ def run(jobs: Sequence[Job], *, at_once: int) -> Outcome:
     shares = [cores[i::at_once] for i in range(at_once)]
     waiting, failed = list(jobs), list[tuple[Job, int]]()
     running = dict[int, tuple[Job, subprocess.Popen]]()
+    progress = Progress([job.folder for job in jobs], say=functools.partial(print, flush=True))
     with signals.catch(lambda: print("stopping the runs ...", flush=True)) as stop:
         try:
             while stop.signal is None and (waiting or running):
-                failed += _ended(running)
+                failed += _ended(running, progress)
                 for slot in range(at_once):
                     if slot not in running and waiting and stop.signal is None:
                         job = waiting.pop(0)
                         running[slot] = job, _start(job, shares[slot])
+                        progress.starts(job.name, job.folder)
+                progress.look()
                 time.sleep(POLL_SECONDS)
         finally:
             for _, process in running.values():
@@ -82,13 +90,15 @@ def run_then(jobs: Sequence[Job], report: Callable[[], None], *, at_once: int) -
     return 1 if outcome.failed else 0
 
 
-def _ended(running: dict[int, tuple[Job, subprocess.Popen]]) -> list[tuple[Job, int]]:
+def _ended(
+    running: dict[int, tuple[Job, subprocess.Popen]], progress: Progress
+) -> list[tuple[Job, int]]:
     """Removes jobs that have ended from `running`; returns those that failed."""
     failed = []
     for slot, (job, process) in list(running.items()):
         if process.poll() is not None:
             del running[slot]
-            print(f"{job.name}: exit code {process.returncode}", flush=True)
+            progress.ends(job.name, job.folder, process.returncode)
             if process.returncode:
                 failed.append((job, process.returncode))
     return failed

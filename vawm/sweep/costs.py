@@ -35,12 +35,11 @@ def main(
     compared: Ablation, argv: Sequence[str] | None, *, description: str | None, script: str
 ) -> int:
     """The main function of a script that measures the first variant against the second."""
-    default = Options(results=ablation.results_folder(script))
-    options = flags.read(Options, argv, default=default, description=description)
+    options = flags.read(Options, argv, description=description)
     check_positive("repeats", options.repeats)
     given = {field.name: getattr(options, field.name) for field in dataclasses.fields(Compared)}
     runs_of_it = ablation.Options(**given)  # to check the options; starts no run
-    sweep = ablation.make_sweep(compared, runs_of_it, ablation.programs_folder(script))
+    sweep = ablation.make_sweep(compared, runs_of_it)
     suite = ablation.scale_of(compared, options).suite
     runs.check(sweep, suite)
     runs.check_places(jobs=1, runs=None, results=options.results)

@@ -31,8 +31,8 @@ class Variant(NamedTuple):
 class Sweep:
     """Runs that differ only in variant, task and seed."""
 
-    program: pathlib.Path
-    """a program of `experiments`, or one that takes the same flags"""
+    program: tuple[str, ...]
+    """words that start a program which trains, or one that takes the same flags"""
     folder: pathlib.Path
     """parent of the folders of the runs"""
     variants: tuple[Variant, ...]
@@ -54,6 +54,24 @@ class Run:
 
     def __str__(self) -> str:
         return f"{self.task} {self.variant} seed={self.seed}"
+
+
+def trains(suite: str) -> tuple[str, ...]:
+    """The words that start the program of a suite, in this Python."""
+    return sys.executable, "-m", "vawm", "train", suite
+
+
+def named_tasks(suite: str, tasks: tuple[str, ...]) -> tuple[str, ...]:
+    """The tasks of a sweep as they were asked for; `all` stands for all of the suite.
+
+    Raises:
+      InvalidInput: `all`, where nobody can list them.
+    """
+    if tasks != ("all",):
+        return tasks
+    if not suites.SUITES[suite].tasks:
+        raise InvalidInput("tasks", "all", f"{suite} has no list of its tasks; name them")
+    return suites.SUITES[suite].tasks
 
 
 def all_runs(sweep: Sweep) -> list[Run]:
@@ -87,7 +105,7 @@ def command(sweep: Sweep, run: Run) -> list[str]:
     path = folder(sweep, run)
     again = [] if run_folder.read_config(path) is None else ["--resume"]
     words = [*flags(sweep, run), "--logdir", str(path), *again]
-    return [sys.executable, str(sweep.program), *words]
+    return [*sweep.program, *words]
 
 
 def finished(sweep: Sweep, run: Run) -> bool:
@@ -107,7 +125,7 @@ def env_steps(sweep: Sweep, run: Run) -> int | None:
 def unfinished_jobs(sweep: Sweep) -> list[Job]:
     """A job for each run that is not finished."""
     return [
-        Job(str(run), command(sweep, run), log(sweep, run))
+        Job(str(run), command(sweep, run), log(sweep, run), folder(sweep, run))
         for run in all_runs(sweep)
         if not finished(sweep, run)
     ]
@@ -123,14 +141,32 @@ def check(sweep: Sweep, suite: str) -> None:
         check_distinct(name, getattr(sweep, name))
     for variant in sweep.variants:
         config = parsed(sweep, Run(sweep.tasks[0], variant.name, sweep.seeds[0]), suite)
-        for seed in sweep.seeds:
-            validate.check(dataclasses.replace(config, seed=seed))
         for task in sweep.tasks:
             suites.check_task(dataclasses.replace(config, task=task))
+        for seed in sweep.seeds:
+            validate.check(dataclasses.replace(config, seed=seed))
+        check_episodes(config)
         for run in all_runs(sweep):
             if run.variant == variant.name:
                 own = dataclasses.replace(config, task=run.task, seed=run.seed)
                 check_started(folder(sweep, run), own)
+
+
+def check_episodes(config: Config) -> None:
+    """Refuses a run in which no episode can end, so that it would have no return.
+
+    Raises:
+      InvalidInput: names the length of the run, and the smallest that has a return.
+    """
+    steps = suites.of(config).episode_steps
+    if steps is None or config.env_steps >= steps * config.num_envs:
+        return
+    remedy = (
+        f"no episode ends in such a run, so it has no return: {steps} control steps in each of "
+        f"{config.num_envs} environments; use at least {steps * config.num_envs}, or fewer "
+        "--num-envs"
+    )
+    raise InvalidInput("env_steps", config.env_steps, remedy)
 
 
 def check_started(path: pathlib.Path, config: Config) -> None:
@@ -175,8 +211,7 @@ def check_places(*, jobs: int, runs: pathlib.Path | None, results: pathlib.Path)
       results: folder of tables and figures.
 
     Raises:
-      InvalidInput: names the option, its value and the remedy.
-      RunError: matplotlib is missing.
+      InvalidInput: names the option, its value and the remedy; or matplotlib is missing.
     """
     check_positive("jobs", jobs)
     run_folder.check_writable(results, "results")

@@ -1,7 +1,7 @@
 """The suites of tasks: one record each, which everything else looks up.
 
-A new suite is a file beside this one, a line in `SUITES`, and its presets in `vawm.presets`.
-No other code asks which suite a run is of.
+A new suite is a file beside this one, a line in `SUITES`, and its presets in
+`vawm.config.presets`. No other code asks which suite a run is of.
 """
 
 from __future__ import annotations

@@ -61,6 +61,16 @@ SUITE = Suite(
     ),
     program="atari100k.py",
     usual_tasks=("breakout",),
+    title="the 26 games of Atari 100k",
+    examples={
+        "--game breakout": "small, on a CPU",
+        "--game krull --preset paper": "100k steps, on a GPU",
+        "--agent storm --game kung_fu_master": "the transformer",
+        "--game freeway --actor.collect-temperature 0.01": "as the paper plays it",
+    },
+    notes="`--game` is short for `--task`. Needs the extra `atari`.",
+    tasks=tuple(atari.GAMES),
+    aliases={"--game": "--task"},
     tables=("atari100k", "atari100k_dreamerv3", "atari100k_storm"),
     human_table="atari100k",
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 
+from vawm import envs
 from vawm.config import Config, VisionConfig
 from vawm.envs.host import rendering, vision
 from vawm.envs.host.pool import Pool
@@ -53,6 +54,15 @@ SUITE = Suite(
     ),
     program="dmc_vision.py",
     usual_tasks=("cartpole_balance",),
+    title="the DeepMind Control Suite, from pixels: 20 tasks",
+    examples={
+        "": "small, on a CPU",
+        "--task walker_walk --preset paper": "on a GPU",
+        "--env.image-size 96": "larger pictures",
+    },
+    notes="Needs the extra `vision`.",
+    tasks=vision.VISION_TASKS,
+    episode_steps=envs.EPISODE_STEPS,
     tables=("dmc_vision_1m",),
     returns=dmc_proprio.SUITE.returns,
     env_bytes=RENDERER_BYTES,

@@ -85,4 +85,14 @@ SUITE = Suite(
     protocol=Protocol(text="whole episodes of the registered environment", episodes=20),
     program="gymnasium_task.py",
     usual_tasks=("vawm/GridWorld-v0",),
+    title="any registered Gymnasium environment; the task is its id",
+    examples={
+        "--task CartPole-v1": "from vectors",
+        "--preset pixels": "a small grid world, from pixels",
+    },
+    notes=(
+        "Checks the environment first and lists all problems at once. To train in one that is "
+        "not registered, call `vawm.runs.runner.run(config, logdir, "
+        "env=vawm.envs.from_gymnasium(...))`."
+    ),
 )

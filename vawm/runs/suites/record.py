@@ -42,6 +42,12 @@ class Suite(NamedTuple):
       protocol: of evaluation.
       program: the file in `experiments` that trains on the suite.
       usual_tasks: those whose learning curves are usually wanted.
+      title: what the tasks are, for a help: "train on ...".
+      examples: flags of a command line -> what it does, for a help.
+      notes: the rest of a help; empty if there is nothing more to say.
+      tasks: all tasks; empty if nobody can list them.
+      aliases: flag -> the flag of which it is another name.
+      episode_steps: control steps of every episode; None if they differ in length.
       tables: published scores, as names of `vawm.policy.scores.TABLES`.
       human_table: that of `tables` with the scores of a human and of random play; empty if
         there is none.
@@ -57,6 +63,12 @@ class Suite(NamedTuple):
     protocol: Protocol
     program: str
     usual_tasks: tuple[str, ...]
+    title: str = ""
+    examples: Mapping[str, str] = {}
+    notes: str = ""
+    tasks: tuple[str, ...] = ()
+    aliases: Mapping[str, str] = {}
+    episode_steps: int | None = None
     rules: Mapping[str, Rule] = {}
     tables: tuple[str, ...] = ()
     human_table: str = ""

@@ -1,4 +1,5 @@
-"""Every choice of a run, as frozen dataclasses; `vawm.presets` has sets of values.
+"""Every choice of a run, as frozen dataclasses; `vawm.config.presets` has sets of
+values.
 
 Numbers are those of the paper, Table 15 for DreamerV3 and Tables 7-14 for STORM, unless their
 comment names another source. Nothing here imports the rest of the package. Factories read
@@ -48,8 +49,11 @@ class WorldModelConfig:
     continue_target: Literal["discounted", "plain"] = "discounted"
     """target of the continue head inside an episode: gamma (discounted) or 1 (plain)"""
     reconstruction_scale: float = 1.0
+    """weight of the reconstruction loss"""
     dynamics_scale: float = 1.0
+    """weight of KL[sg q || p], which trains the prior"""
     representation_scale: float = 0.1
+    """weight of KL[q || sg p], which trains the posterior"""
 
 
 @dataclass(frozen=True)
@@ -57,9 +61,13 @@ class HeadsConfig(WorldModelConfig):
     """A world model with the encoder, decoder, reward and continue heads of DreamerV3."""
 
     encoder_layers: int = 3
+    """hidden layers of the encoder of vectors"""
     decoder_layers: int = 3
+    """hidden layers of the decoder of vectors"""
     reward_layers: int = 1
+    """hidden layers of the reward head"""
     continue_layers: int = 1
+    """hidden layers of the continue head"""
     blocks: int = 8
     """blocks of the layer that the image decoder starts with; of an RSSM also of its GRU"""
 
@@ -77,6 +85,7 @@ class RSSMConfig(HeadsConfig):
     hidden: int = 256
     """width of the layers around h"""
     prior_layers: int = 2
+    """hidden layers from h to the prior"""
     reconstruction_gradient: bool = True
     """whether the reconstruction loss trains the latents, or the decoder alone"""
 
@@ -124,9 +133,11 @@ class StormConfig(WorldModelConfig):
     blocks: int = 2
     """transformer blocks"""
     heads: int = 8
+    """attention heads of a block"""
     feedforward: int = 1024
     """hidden width of a block's feed-forward layer"""
     dropout: float = 0.1
+    """share of activations that training sets to 0 in the transformer"""
     positions: int = 64
     """number of learned positions; no sequence can be longer"""
     vector_layers: int = 2
@@ -146,14 +157,19 @@ class StormConfig(WorldModelConfig):
 @dataclass(frozen=True)
 class ActorConfig:
     layers: int = 3
+    """hidden layers"""
     units: int = 256
+    """width of the hidden layers"""
     network: Network = "dreamerv3"
     """hidden layers. dreamerv3: bias, RMSNorm, SiLU; storm: no bias, LayerNorm, ReLU"""
     unimix: float = 0.01
     """uniform share mixed into a discrete policy"""
     min_std: float = 0.1
+    """smallest standard deviation of a continuous policy"""
     max_std: float = 1.0
+    """largest standard deviation of a continuous policy"""
     scale: float = 1.0
+    """weight of the actor's loss"""
     entropy_scale: float = 1e-3
     """Table 15; public DreamerV3 codes use 3e-4"""
     collect_temperature: float = 1.0
@@ -164,13 +180,17 @@ class ActorConfig:
 @dataclass(frozen=True)
 class CriticConfig:
     layers: int = 3
+    """hidden layers"""
     units: int = 256
+    """width of the hidden layers"""
     network: Network = "dreamerv3"
     """hidden layers, as for the actor; dreamerv3 initially predicts 0, storm does not"""
     bins: int = 255
+    """bins of the two-hot value"""
     bin_spacing: Bins = "symexp"
     """symexp: values spaced by symexp; symlog: evenly spaced symlogs, whose mean is decoded"""
     scale: float = 1.0
+    """weight of the critic's loss on imagined states"""
     slow_rate: float = 0.02
     """1 - EMA decay of the slow critic"""
     slow_scale: float = 1.0
@@ -203,12 +223,17 @@ class ImaginationConfig:
     reach_weights: bool = True
     """whether imagined states are weighted by the probability of reaching them"""
     lambda_: float = 0.95
+    """mixes lambda-returns: 0 bootstraps after one step, 1 only at the horizon"""
     discount_horizon: float = 333.0
     """gamma = 1 - 1 / discount_horizon"""
     return_scale_decay: float = 0.99
+    """decay of the running scale of returns, which advantages are divided by"""
     return_scale_limit: float = 1.0
+    """smallest scale of returns, so that small returns are not enlarged"""
     return_scale_low: float = 0.05
+    """lower quantile of returns that their scale is measured from"""
     return_scale_high: float = 0.95
+    """upper quantile of returns that their scale is measured to"""
 
 
 @dataclass(frozen=True)
@@ -216,7 +241,8 @@ class ValueAlignmentConfig:
     """L_var, Eq. 4 and Eq. 5. The loss and its weight are logged even when off."""
 
     weight: Literal["adaptive", "static", "off"] = "adaptive"
-    """adaptive: 1 / max(1, KL) of each state, Eq. 5; off: plain DreamerV3 or STORM"""
+    """weight of L_var; adaptive: 1 / max(1, KL) of each state, Eq. 5; off: plain DreamerV3 or
+    STORM"""
     static_weight: float = 0.5
     """the weight after the warm-up with weight="static"; Table 3"""
     warmup_steps: int = 10_000
@@ -245,13 +271,19 @@ class LaPropConfig(OptimizerConfig):
     """LaProp after per-tensor adaptive gradient clipping, for all parameters at once."""
 
     learning_rate: float = 4e-5
+    """of all parameters, after the warm-up"""
     warmup_updates: int = 1000
+    """updates over which the learning rate grows from 0"""
     agc: float = 0.3
+    """largest norm of a tensor's gradient, as a share of the norm of its parameters"""
     agc_floor: float = 1e-3
     """smallest parameter norm that AGC assumes"""
     beta1: float = 0.9
+    """decay of the mean of updates"""
     beta2: float = 0.999
+    """decay of the mean of squared gradients"""
     epsilon: float = 1e-20
+    """added to the root of squared gradients"""
 
 
 @dataclass(frozen=True)
@@ -265,13 +297,19 @@ class AdamConfig(OptimizerConfig):
     learning_rate: float = 1e-4
     """of the world model"""
     clip: float = 1000.0
+    """largest norm of the world model's gradient"""
     epsilon: float = 1e-8
+    """added to the root of squared gradients, for the world model"""
     behaviour_learning_rate: float = 3e-5
     """of actor and critic together"""
     behaviour_clip: float = 100.0
+    """largest norm of the gradient of actor and critic"""
     behaviour_epsilon: float = 1e-5
+    """added to the root of squared gradients, for actor and critic"""
     beta1: float = 0.9
+    """decay of the mean of gradients"""
     beta2: float = 0.999
+    """decay of the mean of squared gradients"""
 
 
 @dataclass(frozen=True)
@@ -384,7 +422,7 @@ class Config:
     task: str = "cartpole_swingup"
     """name of the environment in its suite"""
     agent: AgentName = "dreamerv3"
-    """the world model: recurrent (dreamerv3), a transformer (storm), recurrent without noise
+    """the world model; recurrent (dreamerv3), a transformer (storm), recurrent without noise
     (vagram), or one that was registered"""
     preset: str = "paper"
     """set of defaults for the other numbers; custom: all set by flags"""
