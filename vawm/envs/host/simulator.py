@@ -38,7 +38,9 @@ class Simulator(Protocol):
       discrete: whether actions are choices.
       episode_length: steps of a full episode, None if it varies.
 
-    An attribute `notices`, if there is one, is a tuple of lines to say when a run starts.
+    An attribute `notices`, if there is one, is a tuple of lines to say when a run starts. A
+    method `picture()`, if there is one, draws the environment as it is now, `[H, W, 3]` uint8,
+    or returns None if it cannot; it changes nothing.
     """
 
     obs: PyTree

@@ -26,6 +26,7 @@ __all__ = [
     "host_choices",
     "make",
     "make_again",
+    "make_drawn",
     "of",
 ]
 
@@ -61,6 +62,18 @@ def make(config: Config) -> Environment | HostEnvironment:
     return _recorded(config, of(config).make(config, config.env))
 
 
+def make_drawn(config: Config) -> HostEnvironment:
+    """As `make`, but on the host, and with pictures for films if there can be any.
+
+    Raises:
+      InvalidInput: also if no renderer works here.
+    """
+    suite = of(config)
+    make_one: Any = suite.make_drawn or suite.make
+    env: Any = _recorded(config, make_one(config, config.env))
+    return env
+
+
 def _recorded(
     config: Config, env: Environment | HostEnvironment
 ) -> Environment | HostEnvironment:
@@ -94,6 +107,7 @@ def make_again(
     *,
     task: str,
     python: str,
+    drawn: bool = False,
     **changes: Any,
 ) -> Environment | HostEnvironment:
     """The environments that a run was trained in, as its record says. Close those on the host.
@@ -105,13 +119,16 @@ def make_again(
       task: name of the task.
       python: two statements that do with the caller's own environments what a command
         cannot, for the remedy.
+      drawn: whether to make them by `make_drawn`.
       **changes: choices of the suite's environments that differ from those of the run.
 
     Raises:
       InvalidInput: they were made by code of the caller's, or cannot be made here.
     """
+    making = make_drawn if drawn else make
     if made is None:
-        return make(dataclasses.replace(config, env=dataclasses.replace(config.env, **changes)))
+        env = dataclasses.replace(config.env, **changes)
+        return making(dataclasses.replace(config, env=env))
     check_made(made, python=python)
     if made.by not in SUITES:
         raise InvalidInput("env", records.describe(made), f"suite {made.by} is unknown here")
@@ -130,8 +147,9 @@ def make_again(
         env=choices,
     )
     if suite.choices is GymnasiumConfig:
-        return gymnasium.make(config, choices, task=task, **made.kwargs)  # type: ignore[arg-type]
-    return make(config)
+        make_one = gymnasium.make_drawn if drawn else gymnasium.make
+        return make_one(config, choices, task=task, **made.kwargs)  # type: ignore[arg-type]
+    return making(config)
 
 
 def host_choices(config: Config) -> HostEnvConfig | None:

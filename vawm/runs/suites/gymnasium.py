@@ -50,12 +50,18 @@ def make(config: Config, env: GymnasiumConfig, **of_env: Any) -> Pool:
         raise within("env", error) from error
 
 
+def make_drawn(config: Config, env: GymnasiumConfig, **of_env: Any) -> Pool:
+    """The same as `make`, and they can be drawn if their ids can."""
+    return make(config, env, drawn=True, **of_env)
+
+
 SUITE = Suite(
     choices=GymnasiumConfig,
     rules={"time_limit": NOT_NEGATIVE},
     check=check,
     check_task=gymnasium.check_id,
     make=make,
+    make_drawn=make_drawn,
     protocol=Protocol(text="whole episodes of the registered environment", episodes=20),
     program="gymnasium_task.py",
     usual_tasks=("vawm/GridWorld-v0",),
