@@ -21,20 +21,26 @@ from typing import Any, Literal
 import jax
 
 from vawm import envs
+from vawm.agent import make_agent
 from vawm.cli import flags
 from vawm.cli.command_line import guard
 from vawm.envs.protocol import (
     Environment,
+    EnvironmentFailure,
     HostEnvironment,
     check_environment,
     check_positive,
 )
 from vawm.errors import InvalidInput
-from vawm.policy import Policy, load, play, scores
-from vawm.policy.play import How, Score
+from vawm.policy import Policy, load, movies, play, scores
+from vawm.policy.play import FRESH, How, Score
 from vawm.process import cache, huge_pages
-from vawm.runs import suites
+from vawm.process.names import shown
+from vawm.runs import run_folder, suites
+from vawm.runs.reports import film
 
+LONGEST_FILM = 1_000
+"""Steps of a film. Its frames have to fit into memory."""
 AT_ONCE = 8
 """Environments on the host that are stepped together, each with its share of the episodes."""
 
@@ -153,6 +159,52 @@ def check_options(suite: str, *, physics: str | None = None, **choices: Any) -> 
             raise InvalidInput(name, value, f"is not an option of {suite}")
 
 
+def filmed(
+    policy: Policy,
+    *,
+    seed: int = 0,
+    steps: int = LONGEST_FILM,
+    how: How = "sample",
+    **changes: Any,
+) -> film.Film:
+    """Plays and draws one episode in the environments that the policy was trained in.
+
+    A task on MJX is played in dm_control's own simulation, which draws it.
+
+    Args:
+      policy: as `vawm.load` returns it.
+      seed: of the episode and of the actions.
+      steps: longest film, which ends there if the episode does not.
+      how: sample actions from the policy, or take its mode.
+      **changes: choices of the environments that differ from those of training.
+
+    Raises:
+      InvalidInput: they were made by code of the caller's, or no renderer works here.
+      NoPicture: nothing draws them.
+      EnvironmentFailure: drawing or playing failed.
+    """
+    env = suites.make_again(
+        dataclasses.replace(policy.config, num_envs=1),
+        policy.spec.made,
+        task=policy.spec.task,
+        python=in_python(1),
+        drawn=True,
+        **changes,
+    )
+    agent = make_agent(policy.config, policy.spec)
+    with contextlib.closing(env):  # type: ignore[type-var]
+        check_env(policy, env)
+        return film.record(
+            agent,
+            policy.params,
+            policy.model_state,
+            env,  # type: ignore[arg-type]
+            seed=FRESH + seed,
+            steps=steps,
+            how=how,
+        )
+
+
 @contextlib.contextmanager
 def environments(
     policy: Policy, episodes: int, **changes: Any
@@ -207,12 +259,17 @@ class Arguments:
     """probability of sticky actions; for atari100k"""
     seed: int = 0
     """of the episodes and of the actions"""
+    video: pathlib.Path | None = None
+    """also film one episode: a file that ends with .mp4 or .gif"""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Prints the score, one line per physics engine; returns the exit code."""
     arguments = flags.read(Arguments, argv, description=description())
     check(1 if arguments.episodes is None else arguments.episodes, arguments.seed)
+    if arguments.video is not None:
+        run_folder.check_writable(arguments.video.parent, "video")
+        movies.check_name("video", arguments.video)
     cache.enable()
     policy = load(arguments.logdir)
     suite, task = policy.config.suite, policy.spec.task
@@ -228,7 +285,28 @@ def main(argv: Sequence[str] | None = None) -> int:
             **options,
         )
         print(f"  {name:6} {score}{_normalized(suite, task, score)}", flush=True)
+    if arguments.video is not None:
+        print(_film(policy, arguments))
     return 0
+
+
+def _film(policy: Policy, arguments: Arguments) -> str:
+    """Writes the film that was asked for; what came out, in one line.
+
+    The scores count even where nothing can be drawn.
+    """
+    assert arguments.video is not None
+    where = shown(arguments.video)
+    changes = dict(suites.of(policy.config).protocol.changes)
+    if arguments.sticky:
+        changes["sticky"] = arguments.sticky
+    try:
+        made = filmed(policy, seed=arguments.seed, how=arguments.how, **changes)
+    except (InvalidInput, film.NoPicture, EnvironmentFailure) as error:
+        return f"  no film in {where}: {flags.in_flags(error)}"
+    arguments.video.parent.mkdir(parents=True, exist_ok=True)
+    movies.write(film.frames(made), arguments.video)
+    return f"  film of an episode with return {made.returns[-1]:.1f}: {where}"
 
 
 def description() -> str:

@@ -32,14 +32,13 @@ import numpy as np
 
 from vawm import evaluate
 from vawm.agent import parameter_count, registry
-from vawm.analysis import movies
 from vawm.cli import flags
 from vawm.cli.command_line import guard
 from vawm.config import Config
 from vawm.envs import made as records
 from vawm.envs.host.usable import one_line
 from vawm.errors import InvalidInput
-from vawm.policy import Policy, hub, load, weights
+from vawm.policy import Policy, hub, load, movies, weights
 from vawm.policy.play import Score
 from vawm.process import cache, huge_pages, names
 from vawm.runs import checkpoint, suites

@@ -12,7 +12,8 @@ from analysis_records import make_episodes, make_policy
 from PIL import Image
 from refusals import refused
 
-from vawm.analysis import figures, film, movies, trajectories
+from vawm.analysis import figures, film, trajectories
+from vawm.policy import movies
 from vawm.runs.reports import video
 from vawm.types import EnvSpec
 

@@ -105,7 +105,6 @@ def drawn(monkeypatch):
         (["--logdirs", "RUN", "--depth", "0"], "depth=0: "),
         (["--logdirs", "RUN", "--context", "1"], "context=1: "),
         (["--logdirs", "RUN", "--player", "."], "logdir='.': "),
-        (["--logdirs", "RUN", "--what", "film"], "what='film': "),
         (
             ["--logdirs", "RUN", "STRANGER", "--player", "RUN"],
             "player='obs ShapeDtypeStruct(shape=(2,), dtype=float32)': stranger was trained "
@@ -156,7 +155,7 @@ def test_a_whole_analysis(run, offline, tmp_path, capsys):
     }
     written = {"values", "trajectories", "saliency", "curves"}
     expected = {f"{name}.png" for name in pictures} | {f"{name}.csv" for name in written}
-    assert files == expected | {"summary.json"}
+    assert files == expected | {"summary.json", "film_tiny.gif"}
     assert all((output / name).stat().st_size for name in files)
     with (output / "values.csv").open() as file:
         rows = [row for row in csv.DictReader(file) if row["measure"] == "value"]

@@ -10,9 +10,10 @@ import tiny_vagram
 from analysis_records import make_episodes, make_policy
 from refusals import refused
 
-from vawm.analysis import movies, trajectories
+from vawm.analysis import trajectories
 from vawm.analysis.trajectories import Trajectories
 from vawm.losses.transforms import symlog
+from vawm.policy import movies
 
 
 @pytest.fixture(
@@ -95,7 +96,7 @@ def test_an_impossible_depth_is_refused(played):
 
 def test_importing_the_package_does_not_import_matplotlib_or_imageio():
     script = (
-        "import sys, vawm.analysis.figures, vawm.analysis.movies, vawm.analysis.values;"
+        "import sys, vawm.analysis.figures, vawm.policy.movies, vawm.analysis.values;"
         "sys.exit(any(name in sys.modules for name in ('matplotlib', 'imageio')))"
     )
     assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0

@@ -142,7 +142,7 @@ def test_the_program_trains_on_mjx(own, tmp_path, monkeypatch):
     run = "--num-envs 2 --env-steps 600 --train-ratio 2 --log-every 100"
     flags = f"{run} {batch} {sizes}"
     logdir = tmp_path / "run"
-    assert own.main([*flags.split(), "--logdir", str(logdir)]) == 0
+    assert own.main([*flags.split(), "--logdir", str(logdir), "--no-film"]) == 0
     policy = vawm.load(logdir)
     assert (policy.config.agent, policy.config.task) == ("gru", "cartpole_balance")
     assert lines(logdir)[-1]["updates"] > 0

@@ -27,7 +27,8 @@ def usual_handlers():
 SCRIPT = """
 import ctypes, sys
 from vawm.process import signals
-with signals.catch(lambda: print("asked", flush=True)) as stop:
+last = lambda: print("last words", flush=True)
+with signals.catch(lambda: print("asked", flush=True), at_end=last) as stop:
     print("ready", flush=True)
     libc = ctypes.CDLL(None)
     for _ in range(600):  # a call of compiled code that signals do not end
@@ -56,7 +57,7 @@ def test_signals_end_a_process_with_the_code_that_shells_expect(number, code, ti
     if times != "once":
         process.send_signal(number)
     assert process.wait(timeout=30) == code
-    assert process.stdout.read() == ("" if times == "twice" else "in order\n")
+    assert process.stdout.read() == ("last words\n" if times == "twice" else "in order\n")
     process.stdout.close()
 
 

@@ -517,13 +517,33 @@ def test_the_banner_is_printed_after_the_folder_is_locked(tmp_path, fake, monkey
     fake()
     console = quiet()
     run(tiny.CONFIG, tmp_path / "run", console=console, banner="who I am")
-    assert console.file.getvalue().startswith("who I am\n")
+    first = f"logdir: {tmp_path / 'run'}\n"
+    assert console.file.getvalue().startswith(f"{first}who I am\n")
     console = quiet()
     monkeypatch.setattr(runner.run_folder, "check_new", lambda _: None)
     (tmp_path / "file").touch()
     with refused("logdir", str(tmp_path / "file" / "run")):
         run(tiny.CONFIG, tmp_path / "file" / "run", console=console, banner="who I am")
     assert not console.file.getvalue()
+
+
+def test_a_run_without_a_banner_says_where_and_what_it_is(tmp_path, fake):
+    fake()
+    console = rich.console.Console(file=io.StringIO(), width=200)
+    run(tiny.CONFIG, tmp_path, console=console)
+    first, second, third, *_ = console.file.getvalue().splitlines()
+    assert first == f"logdir: {tmp_path}"
+    for told in ("dreamerv3", "preset custom", toy.SPEC.task, "96 env steps", "size custom"):
+        assert told in second
+    assert "after 24 env steps" in third
+
+
+@pytest.mark.parametrize("display", ["plain", "quiet"])
+def test_a_run_can_be_quiet(tmp_path, fake, capsys, display):
+    fake()
+    run(tiny.CONFIG, tmp_path, console=None, display=display)
+    assert bool(capsys.readouterr().out) == (display == "plain")
+    assert len(lines(tmp_path)) == 6
 
 
 @pytest.mark.parametrize(
@@ -727,6 +747,14 @@ def test_a_run_whose_newest_checkpoint_is_damaged_resumes_from_the_one_before(
     assert (checkpoint.root(logdir) / "damaged-000000000192").is_dir()
     assert saves(logdir) == saves(uninterrupted)
     assert_same(logdir, uninterrupted, LONG, tiny.env())
+
+
+def test_a_resumed_run_shows_the_last_return_before(tmp_path, uninterrupted):
+    logdir = shutil.copytree(uninterrupted, tmp_path / "run")
+    told = [x for line in lines(logdir) if (x := line["episode/return"]) is not None]
+    console = quiet()
+    run(tiny.config(env_steps=200), logdir, resume=True, console=console)
+    assert f"last episode return {told[-1]:.1f}\n" in console.file.getvalue()
 
 
 def test_resuming_with_another_jax_causes_a_warning(tmp_path, monkeypatch):

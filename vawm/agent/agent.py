@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from vawm.agent import registry
 from vawm.agent.actor_critic import Actor, Critic, make_actor, make_critic
 from vawm.config import Config
-from vawm.types import Array, EnvSpec, Inference, Key, Params, PyTree, TimeStep
+from vawm.types import Array, EnvSpec, Inference, Key, Latent, Params, PyTree, TimeStep
 from vawm.world_model.protocol import WorldModel
 
 
@@ -73,6 +73,20 @@ class Agent(NamedTuple):
           how: "sample" from the policy; "collect": sample at `actor.collect_temperature`; or
             "mode", the most likely action.
         """
+        carry, action, _ = self.see(params, model_state, key, carry, timestep, how=how)
+        return carry, action
+
+    def see(
+        self,
+        params: Params,
+        model_state: PyTree,
+        key: Key,
+        carry: PolicyCarry,
+        timestep: TimeStep,
+        *,
+        how: Literal["collect", "sample", "mode"] = "sample",
+    ) -> tuple[PolicyCarry, Array, Latent]:
+        """As `act`, and the latent `[N, ...]` from which the action was chosen."""
         key_filter, key_action = jax.random.split(key)
         memory, latent = self.world_model.filter(
             params.world_model,
@@ -87,7 +101,7 @@ class Agent(NamedTuple):
         distribution = choose(params.actor, latent)
         action = distribution.mode() if how == "mode" else distribution.sample(key_action)
         action = jnp.where(timestep.is_last[:, None], 0.0, action)
-        return PolicyCarry(memory, action), action
+        return PolicyCarry(memory, action), action, latent
 
     def random_action(self, key: Key, timestep: TimeStep) -> Array:
         """A uniformly random action: one of all choices, or numbers in [-1, 1]."""

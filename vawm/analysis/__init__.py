@@ -7,7 +7,7 @@
     vawm.analysis.saliency       what the value, the decoder and the critic depend on
     vawm.analysis.curves         losses and weights over a training, several runs together
     vawm.analysis.tables         CSV and JSON
-    vawm.analysis.figures, vawm.analysis.movies   pictures; they need the extra `analysis`
+    vawm.analysis.figures, vawm.policy.movies   pictures; they need the extra `analysis`
     vawm.analysis.program        the command line, `vawm analyse`
 
 All other modules compute numbers.

@@ -7,7 +7,8 @@
     trajectories   imagination against the truth, Figs 3 and 7
     saliency       what decoder and value depend on, Figs 3 and 13
     values         value errors by depth of imagination, and actual returns
-    film           truth, imagination and value side by side, as a GIF; for runs from pixels
+    film           truth, imagination and value side by side, as a GIF; for vectors, coordinates
+                   over time, truth against imagination
     curves         losses and the weight of value alignment in training, Figs 8, 9 and 12
 
 Plays whole episodes of every run in its own environments; everything but `curves` uses these.
@@ -32,7 +33,7 @@ from vawm.analysis import (
     figures,
     film,
     inference,
-    movies,
+    motion,
     saliency,
     tables,
     trajectories,
@@ -41,9 +42,10 @@ from vawm.analysis import (
 from vawm.analysis.episodes import Episodes
 from vawm.cli import flags
 from vawm.config import Config
+from vawm.envs import coordinates
 from vawm.envs.protocol import check_positive
 from vawm.errors import InvalidInput
-from vawm.policy import Policy, load
+from vawm.policy import Policy, load, movies
 from vawm.process import cache
 from vawm.process.names import shown
 from vawm.runs import checkpoint, run_folder
@@ -158,8 +160,6 @@ def check(options: Options, name: str, policy: Policy, player: Policy | None) ->
     inference.check(policy.config, context=options.context, depth=options.depth)
     if options.wants("trajectories") and has_images(policy):
         movies.check()
-    if options.what == "film" and not has_images(policy):
-        raise InvalidInput("what", "film", f"{name} observes no images; use 'trajectories'")
 
 
 def has_images(policy: Policy) -> bool:
@@ -218,7 +218,9 @@ def show_saliency(options: Options, played: Sequence[Played]) -> None:
 
 def show_film(options: Options, played: Sequence[Played]) -> None:
     for name, policy, record in played:
-        if has_images(policy):
+        if not has_images(policy):
+            show_motion(options, name, policy, record)
+        else:
             made = film.make(
                 policy,
                 record,
@@ -229,6 +231,22 @@ def show_film(options: Options, played: Sequence[Played]) -> None:
             )
             path = options.output / f"film_{name}.gif"
             movies.write_gif(film.frames(made), path, per_second=FILM_FRAMES_PER_SECOND)
+
+
+def show_motion(options: Options, name: str, policy: Policy, record: Episodes) -> None:
+    """The film of a run that observes vectors."""
+    window = trajectories.imagine(
+        policy,
+        record,
+        context=options.context,
+        depth=options.depth,
+        seed=options.seed,
+        at_most=1,
+    )
+    size = sum(leaf.shape[0] for leaf in jax.tree.leaves(policy.spec.obs))
+    shown = motion.frames(window, coordinates.names(policy.spec.task, size))
+    path = options.output / f"film_{name}.gif"
+    movies.write_gif(shown, path, per_second=FILM_FRAMES_PER_SECOND)
 
 
 def show_values(options: Options, played: Sequence[Played]) -> None:

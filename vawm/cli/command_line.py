@@ -26,6 +26,7 @@ from vawm.errors import InvalidInput
 from vawm.process import cache, names, streams
 from vawm.runs import resume, runner, suites, validate
 from vawm.runs.checkpoint import SaveError
+from vawm.runs.reports.display import Mode
 from vawm.runs.runner import RunError
 
 FIRST = (
@@ -50,6 +51,8 @@ class Arguments(NamedTuple):
     logdir: pathlib.Path
     resume: bool
     fresh: bool = False
+    display: Mode = "auto"
+    film: bool = True
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,6 +66,11 @@ class Flags:
     """continue the run in --logdir, with its own settings as defaults"""
     fresh: bool = False
     """start over in --logdir; what is there is moved into a folder replaced-1, -2 ... in it"""
+    display: Mode = "auto"
+    """a bar, plain lines for a log, or quiet: warnings alone; auto: a bar on a terminal, else
+    plain"""
+    film: bool = True
+    """at the end of the run, film its policy for ten seconds, where a renderer works"""
 
 
 def train(
@@ -92,6 +100,8 @@ def train(
         logdir,
         resume=arguments.resume,
         fresh=arguments.fresh,
+        display=arguments.display,
+        film_policy=arguments.film,
         banner=describe(config),
         command=command or f"python {names.quoted(pathlib.Path(sys.argv[0]))}",
     )
@@ -138,7 +148,7 @@ def parse(
         remedy = f"this program runs suite {suite}; use the one of that suite"
         raise InvalidInput("suite", config.suite, remedy)
     logdir = given.logdir or default_logdir(config)
-    return Arguments(config, logdir, given.resume, given.fresh)
+    return Arguments(config, logdir, given.resume, given.fresh, given.display, given.film)
 
 
 def describe_suite(suite: str, command: str) -> str:

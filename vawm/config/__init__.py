@@ -448,6 +448,10 @@ class Config:
     """where metrics and videos go in addition to metrics.jsonl and TensorBoard"""
     tracker_project: str = "vawm"
     """name of the project at the tracker"""
+    tracker_group: str = ""
+    """runs with the same group stand together at the tracker"""
+    tracker_tags: str = ""
+    """tags of the run at the tracker, with commas between them"""
     log_every: int = 2_000
     """env steps between lines of metrics.jsonl"""
     save_every: int = 50_000

@@ -14,6 +14,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 BURST_SECONDS = 1.0
 """Signals this close together count as one: `timeout` sends two, a terminal signals every
 process."""
+LAST_SECONDS = 0.5
 
 
 class Stop:
@@ -28,7 +29,9 @@ class Stop:
 
 
 @contextlib.contextmanager
-def catch(notify: Callable[[], None] = lambda: None) -> Iterator[Stop]:
+def catch(
+    notify: Callable[[], None] = lambda: None, *, at_end: Callable[[], None] = lambda: None
+) -> Iterator[Stop]:
     """Turns the first signal into a request; a later one ends the process at once.
 
     A thread reads signals from a pipe, because Python runs its own handlers only between
@@ -39,6 +42,7 @@ def catch(notify: Callable[[], None] = lambda: None) -> Iterator[Stop]:
 
     Args:
       notify: called at the first signal, in the thread that reads signals.
+      at_end: called before a later one ends the process, which waits `LAST_SECONDS` for it.
     """
     stop, asked = Stop(), 0.0
     ignored = signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
@@ -59,6 +63,9 @@ def catch(notify: Callable[[], None] = lambda: None) -> Iterator[Stop]:
                 with contextlib.suppress(BaseException):  # the terminal may be closed
                     notify()
             elif time.monotonic() - asked > BURST_SECONDS:
+                last = threading.Thread(target=at_end, daemon=True)
+                last.start()
+                last.join(LAST_SECONDS)  # a terminal that is stopped would block it
                 os._exit(128 + received[0])
 
     thread = threading.Thread(target=listen, daemon=True)

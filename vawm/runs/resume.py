@@ -34,6 +34,8 @@ MAY_DIFFER = (
     "env.on_failure",
     "tracker",
     "tracker_project",
+    "tracker_group",
+    "tracker_tags",
 )
 """Fields that may differ: they change neither what a run learns nor what it has stored."""
 

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple, NoReturn
 import jax
 import rich.console
 
-from vawm.agent import registry
+from vawm.agent import Agent, registry
 from vawm.config import Config
 from vawm.envs import made
 from vawm.envs.protocol import (
@@ -30,11 +30,13 @@ from vawm.envs.protocol import (
     check_environment,
 )
 from vawm.errors import InvalidInput, assignment
+from vawm.learning.state import Learner
 from vawm.process import names, signals, streams
 from vawm.runs import budget, checkpoint, diagnosis, run_folder, settings, suites, validate
 from vawm.runs.checkpoint import manifest
-from vawm.runs.reports import backends, tracking, video
-from vawm.runs.reports.display import Display
+from vawm.runs.reports import backends, film, header, tracking, video
+from vawm.runs.reports.display import Display, Mode
+from vawm.runs.reports.pace import Pace, Totals
 from vawm.runs.reports.tracking import Interval, Line
 from vawm.runs.resume import check as check_resume
 from vawm.runs.resume import check_environments, cut_back, restore, saved_made, saved_spec
@@ -72,6 +74,10 @@ class Progress(NamedTuple):
     logged: int = 0
     interval: Interval = Interval()
 
+    @property
+    def totals(self) -> Totals:
+        return Totals(self.env_steps, self.updates, self.seconds)
+
 
 class Result(NamedTuple):
     """How a run ended.
@@ -104,6 +110,8 @@ def run(
     fresh: bool = False,
     env: Environment | HostEnvironment | None = None,
     console: rich.console.Console | None = None,
+    display: Mode = "auto",
+    film_policy: bool = False,
     banner: str = "",
     command: str = "the same command",
 ) -> Result:
@@ -118,7 +126,11 @@ def run(
       env: replaces the environment that `config.task` names, or that the resumed run was
         trained in; a host environment is closed at the end.
       console: prints progress; standard output by default.
-      banner: printed when the run starts, after all checks.
+      display: a bar, a line per line of metrics (plain), or warnings alone (quiet); auto: a
+        bar if `console` is a terminal, else plain.
+      film_policy: whether a run that reaches its end makes a short film of its policy.
+      banner: what the run is, printed below its folder when all checks are done; some of the
+        config if empty.
       command: the caller's command line, for the advice at the end.
 
     Raises:
@@ -128,8 +140,7 @@ def run(
       SaveError: a checkpoint could not be written.
     """
     logdir = checkpoint.expanded(logdir)
-    console = console or rich.console.Console()
-    say = functools.partial(console.print, highlight=False, soft_wrap=True, markup=False)
+    shown = Display(console, mode=display)
     if env is not None:
         check_environment(env)
     with contextlib.ExitStack() as stack:
@@ -141,30 +152,35 @@ def run(
         if env is None and resume:
             env = _made_again(config, logdir)
         trainer = stack.enter_context(contextlib.closing(prepare(config, env)))
-        if resume:
-            for warning in check_environments(logdir, trainer.spec):
-                say(f"WARNING: {warning}")
-        stack.enter_context(run_folder.claim(logdir, say=say))
-        if banner:
-            say(banner)
+        differences = check_environments(logdir, trainer.spec) if resume else []
+        warnings = [f"WARNING: {difference}" for difference in differences]
+        stack.enter_context(run_folder.claim(logdir, say=warnings.append))
+        stack.enter_context(shown)
+        shown.note(f"logdir: {names.shown(logdir)}")
+        shown.head(banner or header.text(config, trainer.spec.task))
+        for warning in warnings:
+            shown.warn(warning)
         for notice in trainer.notices:
-            say(f"note: {notice}")
+            shown.note(f"note: {notice}")
         if resume and checkpoint.latest(logdir):
-            state, progress = _continue(logdir, trainer, say)
+            state, progress = _continue(logdir, trainer, shown)
             run_folder.write_config(logdir, config, trainer.spec.made)
         else:
             if fresh and (aside := run_folder.put_aside(logdir)):
                 old, new = names.shown(logdir), names.shown(aside)
-                say(f"starting over; moved the old content of {old} to {new}")
+                shown.note(f"starting over; moved the old content of {old} to {new}")
             if resume:
                 run_folder.clear(logdir)
-                say(f"no checkpoint in {names.shown(logdir)} yet; starting from the beginning")
+                folder = names.shown(logdir)
+                shown.note(f"no checkpoint in {folder} yet; starting from the beginning")
             run_folder.write_config(logdir, config, trainer.spec.made)
-            state, progress = trainer.init(config.seed), Progress()
+            with shown.busy("preparing"):
+                state, progress = trainer.init(config.seed), Progress()
             _refuse_nonfinite(state)
-        result = _loop(config, logdir, trainer, state, progress, console)
+        result = _loop(config, logdir, trainer, state, progress, shown, film_policy=film_policy)
     known = trainer.spec.made is not None and made.can_be_made_again(trainer.spec.made)
-    _summarise(config, result, say, command, by_command=by_command, again=by_command or known)
+    again = by_command or known
+    _summarise(config, result, shown.note, command, by_command=by_command, again=again)
     return result
 
 
@@ -262,26 +278,27 @@ def prepare(
 
 
 def _continue(
-    logdir: pathlib.Path, trainer: Trainer, say: Callable[[str], None]
+    logdir: pathlib.Path, trainer: Trainer, display: Display
 ) -> tuple[PyTree, Progress]:
-    restored = restore(logdir, trainer.shapes)
+    with display.busy("reading the checkpoint"):
+        restored = restore(logdir, trainer.shapes)
     if restored.warning:
-        say(f"WARNING: {restored.warning}")
+        display.warn(f"WARNING: {restored.warning}")
     then, now = restored.manifest.computed, manifest.computed()
     if then != now:
         text = f"started with {then}, resuming with {now}: results may not be bit-identical"
-        say(f"WARNING: {text}")
+        display.warn(f"WARNING: {text}")
     state, lost = trainer.resume(restored.state, restored.episodes)
     if lost:
-        say(
+        display.warn(
             f"warning: the episodes of {lost} of {trainer.spec.num_envs} environments could "
             "not be replayed exactly; starting new episodes"
         )
     progress = _progress(restored.manifest.progress)
     missing = cut_back(logdir, env_steps=progress.env_steps, logged=progress.logged)
     if missing:
-        say(f"WARNING: {missing}")
-    say(f"resuming at {progress.env_steps} env steps")
+        display.warn(f"WARNING: {missing}")
+    display.note(f"resuming at {progress.env_steps} env steps")
     return state, progress
 
 
@@ -309,16 +326,17 @@ def _loop(
     trainer: Trainer,
     state: PyTree,
     progress: Progress,
-    console: rich.console.Console,
+    display: Display,
+    *,
+    film_policy: bool,
 ) -> Result:
     """Runs chunk after chunk; the only place where the host waits for the device."""
-    display = Display(console, start=progress.env_steps, total=config.env_steps)
-    film = video.make(trainer, config)
+    film_replay = video.make(trainer, config)
     log_save = functools.partial(_append, logdir / tracking.SAVE_LINES)
     last_saved = progress.env_steps
     resumed = bool(progress.env_steps)
     with (
-        signals.catch(lambda: display.note("stopping after this step ...")) as stop,
+        signals.catch(display.stopping, at_end=display.release) as stop,
         tracking.Tracker(
             logdir,
             purge_after=progress.logged if resumed else None,
@@ -326,30 +344,38 @@ def _loop(
                 config,
                 logdir,
                 resumed=resumed,
-                say=display.note,
+                say=display.warn,
                 hurried=lambda: stop.signal is not None,
             ),
-            say=display.note,
+            say=display.warn,
+            choices=dict(validate.values(config)),
         ) as tracker,
-        display,
         checkpoint.Saver(
             logdir,
             config,
             trainer.spec,
             before=logdir / tracking.METRICS,
             log=log_save,
-            say=display.note,
+            say=display.warn,
         ) as saver,
     ):
         tracker.show_videos(after=progress.logged)
-        display.note("compiling (about a minute, seconds if cached) ...")
-        step = trainer.compile(state).run
+        with display.busy("compiling", done="compiled", hint="a minute, seconds if cached"):
+            step = trainer.compile(state).run
         last = progress.env_steps >= config.env_steps or stop.signal is not None
+        if not last:
+            display.begin(
+                progress.totals,
+                total=config.env_steps,
+                pace=Pace(_updates_per_env_step(config), progress.totals),
+                lines=tracking.read(logdir / tracking.METRICS) if resumed else [],
+            )
         while not last:
             before, began = progress.env_steps, time.perf_counter()
             state, metrics = step(state)
             metrics = jax.device_get(metrics)
             progress = advance(progress, metrics, began=began)
+            display.advance(progress.totals, progress.interval)
             done = progress.env_steps >= config.env_steps
             last = done or stop.signal is not None  # read once, so that the last step is saved
             if reason := diagnosis.reason(state, metrics, last=last):
@@ -362,8 +388,8 @@ def _loop(
                 progress = progress._replace(logged=progress.env_steps, interval=Interval())
             elif done:  # an incomplete interval; its line is dropped if the run is extended
                 tracker.write(_line(progress))
-            if film and _crossed(before, progress.env_steps, config.video.every):
-                tracker.write_videos(film(state), env_steps=progress.env_steps)
+            if film_replay and _crossed(before, progress.env_steps, config.video.every):
+                tracker.write_videos(film_replay(state), env_steps=progress.env_steps)
             due = last or saver.is_time()
             due = due or _crossed(before, progress.env_steps, config.save_every)
             if due and progress.env_steps > last_saved:
@@ -374,7 +400,9 @@ def _loop(
                     episodes=trainer.episodes(),
                 )
                 last_saved = progress.env_steps
-            display.advance(progress.env_steps, progress.interval)
+        if film_policy and stop.signal is None:
+            films = _film(config, trainer.agent, state.learner, display)
+            tracker.write_videos(films, env_steps=progress.env_steps)
     return Result(logdir, progress.env_steps, stop.exit_code)
 
 
@@ -400,6 +428,24 @@ def advance(progress: Progress, metrics: Mapping[str, Any], *, began: float) -> 
             seconds=seconds,
         ),
     )
+
+
+def _film(
+    config: Config, agent: Agent, learner: Learner, display: Display
+) -> list[video.Video]:
+    """A film of the policy; none where it cannot be made, which must not fail a whole run."""
+    try:
+        with display.busy("filming the policy"):
+            return [film.of_run(config, agent, learner)]
+    except Exception as error:
+        reason = (str(error).strip() or repr(error)).splitlines()[0]
+        display.note(f"no film of the policy: {reason}")
+        return []
+
+
+def _updates_per_env_step(config: Config) -> float:
+    """While the run learns."""
+    return config.train_ratio / config.replay.batch_steps / config.action_repeat
 
 
 def _crossed(before: int, now: int, every: int) -> bool:

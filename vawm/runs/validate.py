@@ -73,6 +73,7 @@ RULES: dict[str, Rule] = {
 """Field -> what its number must be; positive if not here. Agents and suites add their own."""
 
 KINDS = {bool: "True or False", str: "a text"}
+LONGEST_LABEL = 64  # characters of a tag, at Weights & Biases
 INT32 = 2**31  # whole numbers are counted with on the device, all but the seed
 
 
@@ -152,6 +153,7 @@ def _check_together(config: Config) -> None:
     _check_agent(config)
     _check_names(config)
     _check_project(config.tracker_project)
+    _check_labels(config)
     _check_imagination(config)
     registry.kind(config.agent).check(config)
     _check_replay(config)
@@ -212,6 +214,20 @@ def _check_project(name: str) -> None:
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}", name):
         remedy = "use up to 100 letters, digits, '-', '_' and '.', a letter or digit first"
         raise InvalidInput("tracker_project", name, remedy)
+
+
+def _check_labels(config: Config) -> None:
+    """The tracker's group and tags are short texts on one line, as trackers take them."""
+    for name, texts in (
+        ("tracker_group", [config.tracker_group]),
+        ("tracker_tags", config.tracker_tags.split(",")),
+    ):
+        value = getattr(config, name)
+        if value and not all(
+            text.isprintable() and 0 < len(text.strip()) <= LONGEST_LABEL for text in texts
+        ):
+            remedy = f"use texts of 1 to {LONGEST_LABEL} characters"
+            raise InvalidInput(name, value, remedy)
 
 
 def _check_imagination(config: Config) -> None:

@@ -104,7 +104,7 @@ def command(sweep: Sweep, run: Run) -> list[str]:
     """The command that starts the run, or resumes it."""
     path = folder(sweep, run)
     again = [] if run_folder.read_config(path) is None else ["--resume"]
-    words = [*flags(sweep, run), "--logdir", str(path), *again]
+    words = [*flags(sweep, run), "--logdir", str(path), "--no-film", *again]
     return [*sweep.program, *words]
 
 

@@ -248,6 +248,50 @@ def test_another_project_or_a_new_run_is_a_new_remote_run(tmp_path, monkeypatch,
     assert json.loads((tmp_path / backends.RECORD).read_text())["line"] == 24
 
 
+@pytest.mark.parametrize(
+    ("changes", "group", "tags"),
+    [
+        ({}, None, []),
+        (
+            {"tracker_group": "sweep 1", "tracker_tags": "ours, tiny"},
+            "sweep 1",
+            ["ours", "tiny"],
+        ),
+    ],
+)
+def test_trackers_get_group_and_tags(tmp_path, monkeypatch, changes, group, tags):
+    taken = {}
+    wandb = types.SimpleNamespace(
+        setup=lambda: types.SimpleNamespace(settings=types.SimpleNamespace(mode="offline")),
+        init=lambda **given: taken.update(wandb=given),
+        Settings=dict,
+        Video=None,
+    )
+    trackio = types.SimpleNamespace(
+        init=lambda **given: taken.update(trackio=given), Video=None
+    )
+    for name, module in (("wandb", wandb), ("trackio", trackio)):
+        monkeypatch.setitem(sys.modules, name, module)
+        backends.OPENERS[name](tiny.config(tracker=name, **changes), tmp_path, "id")
+    assert (taken["wandb"]["group"], taken["wandb"]["tags"]) == (group, tags or None)
+    assert (taken["trackio"]["group"], taken["trackio"]["config"]["tags"]) == (group, tags)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("tracker_group", "two\nlines"),
+        ("tracker_group", " "),
+        ("tracker_tags", "a,,b"),
+        ("tracker_tags", "x" * 65),
+        ("tracker_tags", 3),
+    ],
+)
+def test_groups_and_tags_are_short_texts(field, value):
+    with refused(field, value):
+        validate.check(tiny.config(**{field: value}))
+
+
 @pytest.mark.parametrize("mode", ["online", "shared", "offline", "disabled"])
 def test_wandb_never_prompts_at_the_terminal(tmp_path, monkeypatch, mode):
     """Its prompt would wait for standard input in a thread and keep the process alive."""

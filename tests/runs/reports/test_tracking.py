@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from runs import events
 from tensorboardX.proto.event_pb2 import SessionLog
+from tensorboardX.proto.plugin_hparams_pb2 import HParamsPluginData
 from tensorboardX.record_writer import RecordWriter
 
 from vawm.runs.reports import tracking
@@ -136,6 +137,29 @@ def test_tensorboard_purges_from_the_step_after_the_last_that_is_kept(tmp_path):
         pass
     _, start = events(tmp_path)
     assert (start.step, start.session_log.status) == (97, SessionLog.START)
+
+
+CHOICES = {"seed": 3, "task": "walker_walk", "critic.replay_gradient": True, "actor.scale": 0.5}
+
+
+@pytest.mark.parametrize("purge_after", [None, 96])
+def test_tensorboard_gets_the_choices_of_a_run_and_compares_returns(tmp_path, purge_after):
+    with tracking.Tracker(tmp_path, purge_after=purge_after, choices=CHOICES):
+        pass
+    found = [(e.step, v) for e in events(tmp_path) for v in e.summary.value]
+    assert {step for step, _ in found} == {0 if purge_after is None else 97}
+    parts = {
+        value.tag: HParamsPluginData.FromString(value.metadata.plugin_data.content)
+        for _, value in found
+        if value.metadata.plugin_data.plugin_name == "hparams"
+    }
+    shown = parts["_hparams_/session_start_info"].session_start_info.hparams
+    assert {
+        name: getattr(value, value.WhichOneof("kind")) for name, value in shown.items()
+    } == CHOICES
+    experiment = parts["_hparams_/experiment"].experiment
+    assert {info.name for info in experiment.hparam_infos} == CHOICES.keys()
+    assert [info.name.tag for info in experiment.metric_infos] == ["episode/return"]
 
 
 @pytest.mark.skipif(not pathlib.Path("/dev/full").exists(), reason="needs /dev/full")

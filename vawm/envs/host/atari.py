@@ -184,6 +184,10 @@ class AtariSimulator:
             is_terminal=is_terminal,
         )
 
+    def picture(self) -> np.ndarray:
+        """The whole screen, `[210, 160, 3]` uint8 in most games."""
+        return self._ale.getScreenRGB()
+
     def close(self) -> None:
         """Frees the console."""
         self._ale = self._loaded = None

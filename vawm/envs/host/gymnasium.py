@@ -15,12 +15,13 @@ import importlib
 import importlib.util
 import re
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
 import gymnasium
 import numpy as np
 from gymnasium.envs.registration import EnvSpec as RegisteredEnv
+from gymnasium.envs.registration import load_env_creator
 from gymnasium.wrappers import TimeLimit
 
 from vawm.envs import made
@@ -42,6 +43,7 @@ PACKAGES = {
     r"(MiniGrid|BabyAI)-.+": "minigrid",
 }
 """Pattern of ids -> the package that registers them when it is imported."""
+DRAWN = "rgb_array"
 
 
 class GymnasiumSimulator:
@@ -89,6 +91,12 @@ class GymnasiumSimulator:
             is_terminal=is_terminal,
         )
 
+    def picture(self) -> np.ndarray | None:
+        """What `render` draws; None unless the environment was made to draw pictures."""
+        if self._env.render_mode != DRAWN:
+            return None
+        return np.asarray(self._env.render())
+
     def close(self) -> None:
         self._env.close()
 
@@ -104,6 +112,7 @@ def from_gymnasium(
     check: bool = True,
     task: str | None = None,
     image_size: int = IMAGE_SIZE,
+    drawn: bool = False,
     **kwargs: Any,
 ) -> Pool:
     """Runs N copies of a Gymnasium environment in separate processes.
@@ -118,6 +127,7 @@ def from_gymnasium(
       check: whether to look for `problems` first, with one extra environment.
       task: name of the task; default the name of `make`.
       image_size: pixels a side to which pictures are resized, a multiple of 16 from 48 to 256.
+      drawn: whether a registered environment is asked for pictures to look at, if it has them.
       **kwargs: for `gymnasium.make`, or for the function.
 
     Returns:
@@ -134,7 +144,7 @@ def from_gymnasium(
     check_source(make)
     source = check_id(make) if isinstance(make, str) else make
     task = task or name_of(make)
-    make_env = functools.partial(make_environment, source, task, time_limit, kwargs)
+    make_env = functools.partial(make_environment, source, task, time_limit, kwargs, drawn)
     pool = Pool(
         functools.partial(simulate, make_env, image_size),
         task=task,
@@ -274,8 +284,11 @@ def make_environment(
     task: str,
     time_limit: int | None,
     kwargs: Mapping[str, Any],
+    drawn: bool = False,
 ) -> gymnasium.Env:
     """Makes the environment, even if its id is registered only in the pool's process.
+
+    If it is to be `drawn`, and can be, it renders pictures.
 
     Raises:
       InvalidInput: Gymnasium cannot make it, for example because a package is missing.
@@ -288,9 +301,19 @@ def make_environment(
     limit = {} if time_limit is None else {"max_episode_steps": time_limit}
     settings = {"disable_env_checker": True, **kwargs, **limit}  # `problems` checks instead
     try:
+        if drawn and DRAWN in render_modes(source):
+            settings["render_mode"] = DRAWN
         return gymnasium.make(source, **settings)
     except (gymnasium.error.Error, ImportError) as error:
         raise InvalidInput("env", task, f"cannot be made: {one_line(error)}") from error
+
+
+def render_modes(source: RegisteredEnv) -> Sequence[str]:
+    """How a registered environment can be drawn."""
+    creator: Any = source.entry_point
+    if isinstance(creator, str):
+        creator = load_env_creator(creator)
+    return getattr(creator, "metadata", {}).get("render_modes", ())
 
 
 def simulate(make_env: Callable[[], gymnasium.Env], image_size: int) -> Simulator:

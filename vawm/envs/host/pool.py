@@ -165,6 +165,22 @@ class Pool:
         self._failures[stepped] = 0
         return self._leave(is_first=begun | self._recover(troubles))
 
+    def picture(self) -> np.ndarray | None:
+        """What environment 0 looks like now, as its simulator draws it; None if it does not.
+
+        Raises:
+          EnvironmentFailure: drawing failed. The pool stays as it was.
+        """
+        self._enter("ready")
+        self._crew.tell("picture", {0: None})
+        results, troubles = self._crew.hear()
+        self._state = "ready"
+        if 0 in troubles:
+            episode, step = int(self._index[0]), int(self._length[0])
+            reason = f"cannot be drawn: {troubles[0].reason}"
+            raise EnvironmentFailure(0, episode, step, reason, troubles[0].traceback)
+        return results.get(0)
+
     def episodes(self) -> Episodes:
         """The running episodes, up to the last received time step."""
         length = np.where(self._length <= MAX_KEPT, self._length, -1)

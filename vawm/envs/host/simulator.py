@@ -39,7 +39,9 @@ class Simulator(Protocol):
       episode_length: steps of a full episode, None if it varies.
 
     An attribute `notices`, if there is one, is a tuple of lines to say when a run starts. An
-    attribute `native`, if there is one, is that of `EnvSpec`.
+    attribute `native`, if there is one, is that of `EnvSpec`. A method `picture()`, if there is
+    one, draws the environment as it is now, `[H, W, 3]` uint8, or returns None if it cannot; it
+    changes nothing.
     """
 
     obs: PyTree

@@ -19,6 +19,7 @@ from vawm.errors import InvalidInput, suggestion
 from vawm.types import PyTree, image
 
 VISION_TASKS = tuple(sorted((*TASKS, "quadruped_run", "quadruped_walk")))
+LARGE = 256  # pixels a side of a picture to look at
 USUAL = -1
 """Selects the default camera of the task."""
 CAMERAS = {"quadruped": 2}
@@ -56,6 +57,7 @@ class VisionSimulator:
     action_size: int
     discrete: bool = False
     episode_length: int | None = None
+    _large: tuple[Any, Any] | None
 
     def __init__(
         self,
@@ -86,6 +88,7 @@ class VisionSimulator:
         self._flags = {"shadow": False, "reflection": False} if fast_rendering else None
         number = check_camera(camera, domain, cameras=physics.model.ncam)
         self._camera = mujoco.Camera(physics, image_size, image_size, number)
+        self._number, self._large = number, None
         self._low, self._high = spec.minimum, spec.maximum
         self._action_repeat = action_repeat
         self.obs = image(image_size)
@@ -118,8 +121,32 @@ class VisionSimulator:
             is_terminal=bool(latest.discount == 0),
         )
 
+    def picture(self) -> np.ndarray:
+        """What the agent sees, but large: `[LARGE, LARGE, 3]` uint8."""
+        if self._large is None:
+            self._large = self._make_large()
+        physics, camera = self._large
+        physics.set_state(self._env.physics.get_state())
+        physics.forward()
+        return camera.render(render_flag_overrides=self._flags).copy()
+
+    def _make_large(self) -> tuple[Any, Any]:
+        """A copy of the physics that shares the model, with a camera of its own.
+
+        The size of a context cannot change, and that of the agent's frames must not.
+        """
+        from dm_control import mujoco
+
+        physics = self._env.physics.copy(share_model=True)
+        visual = physics.model.vis.global_
+        visual.offwidth = visual.offheight = LARGE
+        return physics, mujoco.Camera(physics, LARGE, LARGE, self._number)
+
     def close(self) -> None:
         """Frees the rendering context and the simulation; a second call does nothing."""
+        if self._large is not None:
+            self._large[0].free()
+            self._large = None
         self._env.physics.free()
 
     def _frame(self) -> np.ndarray:

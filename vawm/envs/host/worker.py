@@ -182,6 +182,12 @@ class Worker:
                 ended = f"ended after {count} of {len(actions)} steps"
                 raise Unusable("the replayed episode", ended)
 
+    def picture(self, env: int, _: None) -> np.ndarray | None:
+        """What the simulator draws; None if it draws nothing."""
+        draw = getattr(self.simulators[env], "picture", None)
+        drawn = None if draw is None else draw()
+        return None if drawn is None else np.ascontiguousarray(drawn)
+
     def close(self, env: int, _: None = None) -> None:
         """Closes the simulator and ignores its errors."""
         simulator = self.simulators.pop(env, None)

@@ -16,7 +16,8 @@ of its incomplete last interval stays. The step of both backends is `env_steps`.
               run; `wandb sync` sends them. WANDB_ENTITY and wandb's other variables apply.
     trackio   a database on this machine (TRACKIO_DIR), or a server (TRACKIO_SPACE_ID,
               TRACKIO_SERVER_URL). Accepts steps in any order and repeatedly. The field `time`
-              of a line is called `seconds` there.
+              of a line is called `seconds` there. It has no tags: they are the entry `tags` of
+              the run's config.
 """
 
 from __future__ import annotations
@@ -176,6 +177,8 @@ class WeightsAndBiases:
             id=run,
             name=logdir.name,
             dir=str(logdir),
+            group=config.tracker_group or None,
+            tags=tags(config) or None,
             config=as_dict(config),
             allow_val_change=True,
             resume="allow",
@@ -202,7 +205,8 @@ class Trackio:
         self._run = trackio.init(
             project=config.tracker_project,
             name=f"{logdir.name}-{run}",
-            config=as_dict(config),
+            group=config.tracker_group or None,
+            config=as_dict(config) | {"tags": tags(config)},
             resume="allow",
             auto_log_cpu=False,
             auto_log_gpu=False,
@@ -219,6 +223,11 @@ class Trackio:
 
     def close(self) -> None:
         self._run.finish()
+
+
+def tags(config: Config) -> list[str]:
+    """The tags of a run."""
+    return [tag.strip() for tag in config.tracker_tags.split(",") if tag.strip()]
 
 
 OPENERS: dict[str, Callable[[Config, pathlib.Path, str], Backend]] = {

@@ -25,6 +25,7 @@ from typing import Any, NamedTuple, Protocol
 from tensorboardX.proto.event_pb2 import Event, SessionLog
 from tensorboardX.proto.summary_pb2 import Summary
 from tensorboardX.record_writer import RecordWriter
+from tensorboardX.summary import hparams
 
 from vawm.runs.checkpoint.manifest import sync
 from vawm.runs.reports.video import Video, as_gif
@@ -37,6 +38,8 @@ SAVE_LINES = "checkpoints.jsonl"
 """One line per checkpoint: its size, how long saving took, how long training waited."""
 FULL = (errno.ENOSPC, errno.EDQUOT)
 EPISODE_SUMS = ("episode/return", "episode/length")
+COMPARED = "episode/return"
+"""The metric beside the choices of each run in TensorBoard's tab HPARAMS."""
 
 
 class Interval(NamedTuple):
@@ -196,9 +199,17 @@ class Board:
         name = f"events.out.tfevents.{time.time():.6f}.{socket.gethostname()}"
         self._file = RecordWriter(str((logdir / name).absolute()))  # `s3:x` is a folder
         self._add(Event(file_version="brain.Event:2"))
+        self._first = 0 if purge_after is None else purge_after + 1
         if purge_after is not None:
             start = SessionLog(status=SessionLog.START)
-            self._add(Event(step=purge_after + 1, session_log=start))
+            self._add(Event(step=self._first, session_log=start))
+
+    def write_choices(self, choices: Mapping[str, bool | int | float | str]) -> None:
+        """Adds the choices of the run for the tab HPARAMS, by name."""
+        experiment, start, end = hparams(dict(choices), {COMPARED: None})
+        for summary in (experiment, start, end):  # the end: its status, shown from the start
+            self._add(Event(step=self._first, summary=summary))
+        self._file.flush()
 
     def write(self, entry: Line) -> None:
         """Adds the finite numbers of one line of metrics."""
@@ -235,6 +246,7 @@ class Tracker:
       further: backends that handle their own failures, from
         `vawm.runs.reports.backends.connect`.
       say: prints a warning.
+      choices: of the run, by name; TensorBoard shows them, if there are any.
 
     Raises:
       OSError: `metrics.jsonl` or a video cannot be written; every method raises it.
@@ -247,6 +259,7 @@ class Tracker:
         purge_after: int | None = None,
         further: Sequence[Backend] = (),
         say: Callable[[str], None] = print,
+        choices: Mapping[str, bool | int | float | str] | None = None,
     ):
         self._logdir, self._further, self._say = logdir, further, say
         self._file = (logdir / METRICS).open("a")
@@ -255,6 +268,8 @@ class Tracker:
             self._board = Board(logdir, purge_after=purge_after)
         except Exception as error:
             self._drop_board(error)
+        if choices:
+            self._to_board(lambda board: board.write_choices(choices))
 
     def write(self, entry: Line) -> None:
         """Appends one line and flushes the files."""

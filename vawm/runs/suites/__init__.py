@@ -30,6 +30,7 @@ __all__ = [
     "host_choices",
     "make",
     "make_again",
+    "make_drawn",
     "make_one",
     "of",
 ]
@@ -64,6 +65,18 @@ def make(config: Config) -> Environment | HostEnvironment:
       InvalidInput: they cannot be made, for example because a package is missing.
     """
     return _recorded(config, of(config).make(config, config.env))
+
+
+def make_drawn(config: Config) -> HostEnvironment:
+    """As `make`, but on the host, and with pictures for films if there can be any.
+
+    Raises:
+      InvalidInput: also if no renderer works here.
+    """
+    suite = of(config)
+    make_one: Any = suite.make_drawn or suite.make
+    env: Any = _recorded(config, make_one(config, config.env))
+    return env
 
 
 def _recorded(
@@ -105,6 +118,7 @@ def make_again(
     *,
     task: str,
     python: str,
+    drawn: bool = False,
     **changes: Any,
 ) -> Environment | HostEnvironment:
     """The environments that a run was trained in, as its record says. Close those on the host.
@@ -116,6 +130,7 @@ def make_again(
       task: name of the task.
       python: two statements that do with the caller's own environments what a command
         cannot, for the remedy.
+      drawn: whether to make them by `make_drawn`.
       **changes: choices of the suite's environments that differ from those of the run.
 
     Raises:
@@ -123,8 +138,8 @@ def make_again(
     """
     config, kwargs = as_recorded(config, made, python=python, **changes)
     if isinstance(config.env, GymnasiumConfig) and made is not None:
-        return gymnasium.make(config, config.env, task=task, kwargs=kwargs)
-    return make(config)
+        return gymnasium.make(config, config.env, task=task, kwargs=kwargs, drawn=drawn)
+    return make_drawn(config) if drawn else make(config)
 
 
 def make_one(

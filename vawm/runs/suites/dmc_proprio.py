@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import functools
+
 from vawm import envs
-from vawm.config import Config, EnvConfig
+from vawm.config import Config, EnvConfig, HostEnvConfig
+from vawm.envs.host import rendering
+from vawm.envs.host.drawn import ProprioSimulator
+from vawm.envs.host.pool import Pool
 from vawm.envs.protocol import Environment
 from vawm.errors import InvalidInput
+from vawm.runs.suites import on_host
 from vawm.runs.suites.record import Protocol, Suite
 
 
@@ -30,11 +36,28 @@ def make(config: Config, env: EnvConfig) -> Environment:
     return envs.make(config.task, num_envs=config.num_envs, action_repeat=config.action_repeat)
 
 
+def make_drawn(config: Config, env: EnvConfig) -> Pool:
+    """The same tasks in dm_control's own simulation, which can draw them.
+
+    Raises:
+      InvalidInput: no renderer works here.
+    """
+    envs.check_task(config.task)
+    simulator = functools.partial(
+        ProprioSimulator,
+        config.task,
+        renderer=rendering.choose("auto"),
+        action_repeat=config.action_repeat,
+    )
+    return on_host.pool(config, HostEnvConfig(), simulator)
+
+
 SUITE = Suite(
     choices=EnvConfig,
     check=check,
     check_task=envs.check_task,
     make=make,
+    make_drawn=make_drawn,
     protocol=Protocol(
         text="whole episodes of 1000 control steps, simulated on MJX as in training",
         episodes=10,

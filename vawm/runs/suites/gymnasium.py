@@ -33,6 +33,7 @@ def make(
     *,
     task: str | None = None,
     kwargs: Mapping[str, Any] | None = None,
+    drawn: bool = False,
 ) -> Pool:
     """The environments of a run, in processes of their own.
 
@@ -41,6 +42,7 @@ def make(
       env: its choices of the environments.
       task: name of the task; that of the id if None.
       kwargs: for the environment itself.
+      drawn: whether they are asked for pictures to look at, if they have them.
 
     Raises:
       InvalidInput: also for all that does not fit in the environment, at once.
@@ -55,10 +57,16 @@ def make(
             on_failure=env.on_failure,
             image_size=env.image_size,
             task=task,
+            drawn=drawn,
             **kwargs or {},
         )
     except InvalidInput as error:
         raise within("env", error) from error
+
+
+def make_drawn(config: Config, env: GymnasiumConfig) -> Pool:
+    """The same as `make`, and they can be drawn if their ids can."""
+    return make(config, env, drawn=True)
 
 
 def make_one(config: Config, env: GymnasiumConfig, kwargs: Mapping[str, Any]) -> Env:
@@ -82,6 +90,7 @@ SUITE = Suite(
     check=check,
     check_task=gymnasium.check_id,
     make=make,
+    make_drawn=make_drawn,
     protocol=Protocol(text="whole episodes of the registered environment", episodes=20),
     program="gymnasium_task.py",
     usual_tasks=("vawm/GridWorld-v0",),

@@ -39,6 +39,7 @@ class Suite(NamedTuple):
       check: `(config, env)`; raises `InvalidInput` where numbers do not fit together.
       check_task: `(task)`; raises `InvalidInput` for a task that the suite does not have.
       make: `(config, env) -> environments`. Nothing is compiled yet; processes are started.
+      make_drawn: the same on the host, for films; None if those of `make` can be drawn.
       protocol: of evaluation.
       program: the file in `experiments` that trains on the suite.
       usual_tasks: those whose learning curves are usually wanted.
@@ -69,6 +70,7 @@ class Suite(NamedTuple):
     tasks: tuple[str, ...] = ()
     aliases: Mapping[str, str] = {}
     episode_steps: int | None = None
+    make_drawn: Callable[..., HostEnvironment] | None = None
     rules: Mapping[str, Rule] = {}
     tables: tuple[str, ...] = ()
     human_table: str = ""

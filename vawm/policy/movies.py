@@ -26,6 +26,32 @@ def check() -> None:
             raise InvalidInput(package, "not installed", "pip install 'vawm[analysis]'")
 
 
+def check_name(field: str, path: pathlib.Path) -> None:
+    """Refuses the name of a film that is neither an MP4 nor a GIF.
+
+    Raises:
+      InvalidInput: names the endings.
+      RunError: an MP4 needs a package that is not installed.
+    """
+    if path.suffix not in (".mp4", ".gif"):
+        raise InvalidInput(field, str(path), "use a name that ends with .mp4 or .gif")
+    if path.suffix == ".mp4":
+        check()
+
+
+def write(frames: np.ndarray, path: pathlib.Path) -> None:
+    """Writes `[T, H, W, 3]` uint8 frames to what the name of the file says.
+
+    Raises:
+      RunError: a package is not installed.
+      OSError: the file could not be written.
+    """
+    if path.suffix == ".gif":
+        write_gif(frames, path, per_second=FRAMES_PER_SECOND)
+    else:
+        write_mp4(frames, path, enlarge=1)
+
+
 def write_mp4(
     frames: np.ndarray,
     path: pathlib.Path,
