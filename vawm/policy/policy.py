@@ -14,8 +14,7 @@ import jax
 import numpy as np
 
 from vawm.agent import PolicyCarry, make_agent, parameter_count
-from vawm.config import Config, GymnasiumConfig
-from vawm.envs import made as records
+from vawm.config import Config
 from vawm.envs.host import native
 from vawm.envs.host.native import Native
 from vawm.errors import InvalidInput
@@ -126,11 +125,12 @@ class Policy(Trained):
         """
         if self.spec.native is not None:
             return self.spec.native
-        if not of_gymnasium(self):
+        image_size = suites.resized_to(self.config, self.spec.made)
+        if image_size is None:
             return native.of_spec(self.spec)
         with contextlib.closing(self._make_env(None, IN_PYTHON_PURE)) as env:
             own = native.of_spaces(
-                env.observation_space, env.action_space, image_size=image_size(self)
+                env.observation_space, env.action_space, image_size=image_size
             )
         if not native.fits(own, self.spec):
             remedy = f"has other spaces now than in training; in Python: {IN_PYTHON_PURE}"
@@ -167,23 +167,6 @@ class Policy(Trained):
             f"  trained: {self.env_steps:,} of {config.env_steps:,} env steps\n"
             f"  last training return: {score}"
         )
-
-
-def of_gymnasium(policy: Trained) -> bool:
-    """Whether it was trained in an environment of Gymnasium, also by an earlier version."""
-    made = policy.spec.made
-    if made is None:
-        return isinstance(policy.config.env, GymnasiumConfig)
-    return "image_size" in made.options and made.by in ("gymnasium", records.OBJECT)
-
-
-def image_size(policy: Trained) -> int:
-    """Pixels a side to which pictures of an environment of Gymnasium are resized."""
-    made, env = policy.spec.made, policy.config.env
-    if made is not None:
-        return made.options["image_size"]
-    assert isinstance(env, GymnasiumConfig)
-    return env.image_size
 
 
 def load(logdir: str | os.PathLike[str]) -> Policy:

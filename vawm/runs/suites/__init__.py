@@ -33,6 +33,7 @@ __all__ = [
     "make_drawn",
     "make_one",
     "of",
+    "resized_to",
 ]
 
 SUITES: dict[str, Suite] = {
@@ -204,6 +205,15 @@ def as_recorded(
         env=dataclasses.replace(choices, **recorded | changes),
     )
     return config, made.kwargs
+
+
+def resized_to(config: Config, made: Made | None) -> int | None:
+    """Pixels a side to which pictures of an environment of Gymnasium are resized, also by an
+    earlier version; None for others, which have the observations and actions of their spec."""
+    if made is not None:
+        by_gymnasium = made.by in ("gymnasium", records.OBJECT)
+        return made.options.get("image_size") if by_gymnasium else None
+    return config.env.image_size if isinstance(config.env, GymnasiumConfig) else None
 
 
 def host_choices(config: Config) -> HostEnvConfig | None:
