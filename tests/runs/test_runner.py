@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 import rich.console
 import tiny
@@ -29,7 +30,7 @@ from vawm.errors import InvalidInput
 from vawm.learning import replay
 from vawm.runs import budget, checkpoint, diagnosis, runner
 from vawm.runs.checkpoint import manifest
-from vawm.runs.reports import backends, tracking
+from vawm.runs.reports import backends, film, tracking, video
 from vawm.runs.runner import RunError
 from vawm.runs.trainer import CompiledStep, Trainer
 from vawm.types import TimeStep, Trajectory
@@ -536,6 +537,26 @@ def test_a_run_without_a_banner_says_where_and_what_it_is(tmp_path, fake):
     for told in ("dreamerv3", "preset custom", toy.SPEC.task, "96 env steps", "size custom"):
         assert told in second
     assert "after 24 env steps" in third
+
+
+@pytest.mark.parametrize("why", ["", "no renderer here"])
+def test_a_finished_run_films_its_policy_or_says_why_not(tmp_path, fake, monkeypatch, why):
+    def of_run(config, agent, learner):
+        if why:
+            raise InvalidInput("renderer", "auto", why)
+        return video.Video("policy", np.zeros((2, 16, 16, 3), np.uint8), {"return": 3.0})
+
+    fake()
+    monkeypatch.setattr(film, "of_run", of_run)
+    console = quiet()
+    run(tiny.CONFIG, tmp_path, console=console, film_policy=True)
+    shown = [entry["video"] for entry in tracking.read(tmp_path / "videos.jsonl")]
+    assert shown == ([] if why else ["policy-000000000096.gif"])
+    tags = {value.tag for event in events(tmp_path) for value in event.summary.value}
+    assert ("video/policy" in tags) == (not why)
+    assert ("no film of the policy: " in console.file.getvalue()) == bool(why)
+    assert why in console.file.getvalue()
+    assert "finished at 96 env steps" in console.file.getvalue()
 
 
 @pytest.mark.parametrize("display", ["plain", "quiet"])

@@ -9,11 +9,12 @@ import tiny
 import tiny_pixels
 from analysis_records import make_policy
 
-from vawm import evaluate
+from vawm import evaluate, presets
 from vawm.agent import make_agent
 from vawm.envs.host import rendering
 from vawm.envs.protocol import EnvironmentFailure
 from vawm.policy import movies
+from vawm.runs import suites
 from vawm.runs.reports import film
 from vawm.runs.reports.film import Film, NoPicture
 
@@ -154,3 +155,35 @@ def test_another_kind_of_file_is_refused_first(tmp_path, capsys):
     path = str(tmp_path / "a.avi")
     assert evaluate.guard(lambda: evaluate.main(["--logdir", ".", "--video", path])) == 2
     assert capsys.readouterr().err.startswith(f"error: video={path!r}: ")
+
+
+def test_a_task_from_pixels_is_drawn_large_and_its_observations_stay_the_same():
+    if rendering.fault("egl") and rendering.fault("osmesa"):
+        pytest.skip(rendering.fault("egl"))
+    choices = dataclasses.replace(presets.VISION_QUICK.env, fast_rendering=True, workers=1)
+    config = dataclasses.replace(
+        presets.VISION_QUICK, task="reacher_easy", num_envs=1, env=choices
+    )
+    with suites.make_drawn(config) as env:
+        first = env.reset(3).obs
+        large = env.picture()
+        again = env.reset(3).obs
+        env.send(np.ones((1, 2), np.float32))
+        moved = env.receive().obs
+        later = env.picture()
+    assert large.shape == later.shape == (256, 256, 3)
+    assert (first == again).all()
+    assert (first != moved).any()
+    small = large.reshape(64, 4, 64, 4, 3).mean((1, 3))
+    assert abs(small - first[0].astype(float)).mean() < 10
+    assert (large != later).any()
+
+
+def test_a_registered_environment_is_asked_for_its_pictures():
+    config = dataclasses.replace(presets.GYMNASIUM_PIXELS, num_envs=1)
+    with suites.make_drawn(config) as env:
+        seen = env.reset(0).obs[0]
+        assert (env.picture() == seen).all()
+    with suites.make(config) as env:
+        env.reset(0)
+        assert env.picture() is None
