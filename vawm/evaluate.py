@@ -21,7 +21,6 @@ from typing import Any, Literal
 import jax
 
 from vawm import envs
-from vawm.agent import make_agent
 from vawm.cli import flags
 from vawm.cli.command_line import guard
 from vawm.envs.protocol import (
@@ -191,11 +190,10 @@ def filmed(
         drawn=True,
         **changes,
     )
-    agent = make_agent(policy.config, policy.spec)
     with contextlib.closing(env):  # type: ignore[type-var]
         check_env(policy, env)
         return film.record(
-            agent,
+            policy.agent,
             policy.params,
             policy.model_state,
             env,  # type: ignore[arg-type]

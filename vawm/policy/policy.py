@@ -13,7 +13,7 @@ import gymnasium
 import jax
 import numpy as np
 
-from vawm.agent import PolicyCarry, make_agent, parameter_count
+from vawm.agent import Agent, PolicyCarry, make_agent, parameter_count
 from vawm.config import Config
 from vawm.envs.host import native
 from vawm.envs.host.native import Native
@@ -72,6 +72,11 @@ class Policy(Trained):
     or a batch; `act` takes and returns those of the agent. Only `predict` remembers anything
     between calls, in `session`.
     """
+
+    @property
+    def agent(self) -> Agent:
+        """The pure functions that it consists of."""
+        return make_agent(self.config, self.spec)
 
     def act(
         self, key: Key, carry: PolicyCarry, timestep: TimeStep, how: How = "sample"
