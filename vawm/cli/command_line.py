@@ -82,13 +82,7 @@ def train(
     task: str | None = None,
     command: str | None = None,
 ) -> int:
-    """Reads a command line and trains; returns the exit code.
-
-    Args:
-      argv, suite, description, agent, task: as for `parse`.
-      command: what the user has typed before `argv`, for help and advice; the file of the
-        process if None.
-    """
+    """Reads a command line, as `parse` does, and trains; returns the exit code."""
     arguments = parse(
         argv, suite=suite, description=description, agent=agent, task=task, command=command
     )
