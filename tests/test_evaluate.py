@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import tiny
+from analysis_records import make_policy
 
 from vawm import evaluate, presets
 from vawm.agent import make_agent
@@ -18,6 +19,7 @@ from vawm.learning import train
 from vawm.policy import Policy, play, policy
 from vawm.policy.play import Score
 from vawm.runs import checkpoint, suites
+from vawm.runs.reports import film
 from vawm.types import EnvSpec, vector
 
 CARTPOLE = EnvSpec("cartpole_balance", vector(5), 1, False, 2, 5, 200)
@@ -265,3 +267,28 @@ def test_bad_input_is_one_line_and_code_2(tmp_path, capsys, monkeypatch, flags, 
 def test_an_impossible_seed_is_refused(seed):
     with pytest.raises(InvalidInput, match="seed="):
         evaluate.by_protocol(scripted(CARTPOLE, 0.0), episodes=1, seed=seed)
+
+
+def test_a_film_is_of_an_episode_that_training_has_not_played(monkeypatch):
+    calls = {}
+
+    class Drawn:
+        spec = tiny.env().spec
+
+        def close(self):
+            calls["closed"] = True
+
+    def make_again(config, made, **choices):
+        calls["made"] = config.num_envs, choices["drawn"], choices["sticky"]
+        return Drawn()
+
+    def record(agent, params, model_state, env, **choices):
+        calls["record"] = choices
+
+    monkeypatch.setattr(film.suites, "make_again", make_again)
+    monkeypatch.setattr(film, "record", record)
+    policy = make_policy(tiny.CONFIG, tiny.env().spec)
+    evaluate.filmed(policy, seed=3, steps=5, how="mode", sticky=0.25)
+    assert calls["record"] == {"seed": play.FRESH + 3, "steps": 5, "how": "mode"}
+    assert calls["made"] == (1, True, 0.25)
+    assert calls["closed"]

@@ -28,6 +28,7 @@ from vawm.envs.protocol import (
     EnvironmentFailure,
     HostEnvironment,
     check_environment,
+    check_fits,
     check_positive,
 )
 from vawm.errors import InvalidInput
@@ -68,7 +69,7 @@ def evaluate(
     """
     check(episodes, seed)
     check_environment(env)
-    check_env(policy, env)
+    check_fits(policy.spec, env.spec)
     if not isinstance(env, Environment):
         return play.on_host(env, policy, episodes=episodes, seed=seed, how=how)
     if env.spec.num_envs != episodes:
@@ -89,18 +90,6 @@ def check(episodes: int, seed: int) -> None:
     check_positive("episodes", episodes)
     if not 0 <= seed < 2**31:
         raise InvalidInput("seed", seed, f"use a number from 0 to {2**31 - 1}")
-
-
-def check_env(policy: Policy, env: Environment | HostEnvironment) -> None:
-    """Refuses environments whose observations, actions or action repeat are not the policy's.
-
-    Raises:
-      InvalidInput: names what differs.
-    """
-    for name in ("obs", "action_size", "discrete", "action_repeat"):
-        own, theirs = getattr(policy.spec, name), getattr(env.spec, name)
-        if own != theirs:
-            raise InvalidInput("env", f"{name} {theirs}", f"the policy was trained with {own}")
 
 
 def by_protocol(
@@ -182,25 +171,17 @@ def filmed(
       NoPicture: nothing draws them.
       EnvironmentFailure: drawing or playing failed.
     """
-    env = suites.make_again(
-        dataclasses.replace(policy.config, num_envs=1),
-        policy.spec.made,
-        task=policy.spec.task,
+    return film.play(
+        policy.config,
+        policy.agent,
+        policy.params,
+        policy.model_state,
+        seed=FRESH + seed,
+        steps=steps,
         python=in_python(1),
-        drawn=True,
+        how=how,
         **changes,
     )
-    with contextlib.closing(env):  # type: ignore[type-var]
-        check_env(policy, env)
-        return film.record(
-            policy.agent,
-            policy.params,
-            policy.model_state,
-            env,  # type: ignore[arg-type]
-            seed=FRESH + seed,
-            steps=steps,
-            how=how,
-        )
 
 
 @contextlib.contextmanager

@@ -17,9 +17,7 @@ the card, `results.json`, and `replay.mp4` where the environment can be drawn.
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import math
 import os
 import pathlib
 import sys
@@ -27,23 +25,20 @@ import tempfile
 from collections.abc import Sequence
 from typing import Literal
 
-import gymnasium
-import numpy as np
-
 from vawm import evaluate
 from vawm.agent import parameter_count, registry
 from vawm.cli import flags
 from vawm.cli.command_line import guard
 from vawm.config import Config
 from vawm.envs import made as records
-from vawm.envs.host.usable import one_line
+from vawm.envs.protocol import EnvironmentFailure
 from vawm.errors import InvalidInput
 from vawm.policy import Policy, hub, load, movies, weights
 from vawm.policy.play import Score
 from vawm.process import cache, huge_pages, names
 from vawm.runs import checkpoint, suites
 from vawm.runs.checkpoint import manifest
-from vawm.runs.runner import RunError
+from vawm.runs.reports import film as films
 
 LOAD = """\
 import vawm
@@ -57,11 +52,6 @@ action = policy.predict(obs, episode_start=True)"""
 OWN_USAGE = f"""{LOAD}\
 action = policy.predict(obs, episode_start=True)  # an observation of your environment"""
 """How to act once, for the model card."""
-MOST_FRAMES = 1000
-"""Longest film; the rest of a longer episode is left out."""
-FILM_SIDE = 256
-"""Pixels that a side of a film has at least: smaller frames are enlarged."""
-RENDER_MODE = "rgb_array"
 
 Format = Literal["plain", "hub"]
 
@@ -133,44 +123,19 @@ def measured(policy: Policy, scores: Score | None, protocol: str) -> str:
 
 
 def film(policy: Policy, *, seed: int = 0) -> bytes:
-    """An MP4 of one episode, as the environment draws itself or as the policy sees it.
+    """An MP4 of the beginning of one episode, see `vawm.evaluate.filmed`.
 
     Raises:
-      InvalidInput: the environment cannot be made or drawn.
-      RunError: a package for films is not installed.
+      InvalidInput: the environment cannot be made or drawn, or a package is not installed.
+      NoPicture: nothing draws the environment.
+      EnvironmentFailure: drawing or playing failed.
     """
     movies.check()
-    frames = filmed(policy, seed=seed)
-    enlarge = max(1, math.ceil(FILM_SIDE / min(frames.shape[1:3])))
+    shown = films.frames(evaluate.filmed(policy, seed=seed))
     with tempfile.TemporaryDirectory() as folder:
         path = pathlib.Path(folder) / hub.REPLAY
-        movies.write_mp4(frames, path, enlarge=enlarge)
+        movies.write(shown, path)
         return path.read_bytes()
-
-
-def filmed(policy: Policy, *, seed: int) -> np.ndarray:
-    """`[T, H, W, 3]` uint8 frames of the first steps of one episode.
-
-    Raises:
-      InvalidInput: the environment cannot be made or drawn.
-    """
-    frames, session = [], policy.new_session(seed)
-    with contextlib.closing(policy.make_env(render_mode=RENDER_MODE)) as env:
-        obs, _ = env.reset(seed=seed)
-        over = False
-        try:
-            frames.append(env.render())
-            while not over and len(frames) < MOST_FRAMES:
-                obs, _, terminated, truncated, _ = env.step(session.predict(obs))
-                over = terminated or truncated
-                frames.append(env.render())
-        except gymnasium.error.Error as error:  # for example a package is missing
-            raise InvalidInput("render_mode", RENDER_MODE, one_line(error)) from error
-    pictures = [frame for frame in frames if isinstance(frame, np.ndarray)]
-    if not pictures:
-        raise InvalidInput("render_mode", RENDER_MODE, "the environment draws nothing")
-    stack = np.stack(pictures)
-    return np.repeat(stack, 3, axis=-1) if stack.shape[-1] == 1 else stack[..., :3]
 
 
 def card(policy: Policy, measured: str, *, head: str = "") -> str:
@@ -287,8 +252,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.format == "hub":
         try:
             replay = film(policy, seed=arguments.seed)
-        except (InvalidInput, RunError) as error:
-            print(f"without {hub.REPLAY}: {error}")
+        except (InvalidInput, films.NoPicture, EnvironmentFailure) as error:
+            print(f"without {hub.REPLAY}: {flags.in_flags(error)}")
     folder = export(
         arguments.logdir,
         arguments.output,

@@ -20,7 +20,7 @@ import numpy as np
 
 from vawm import evaluate
 from vawm.agent import Agent, PolicyCarry, make_agent
-from vawm.envs.protocol import Environment, HostEnvironment
+from vawm.envs.protocol import Environment, HostEnvironment, check_fits
 from vawm.errors import InvalidInput
 from vawm.policy import Policy
 from vawm.policy.play import FRESH, How
@@ -78,7 +78,7 @@ def record_in(
         without an episode length.
     """
     evaluate.check(episodes, seed)
-    evaluate.check_env(policy, env)
+    check_fits(policy.spec, env.spec)
     agent = make_agent(policy.config, policy.spec)
     if not isinstance(env, Environment):
         return on_host(env, policy, agent, episodes=episodes, seed=seed, how=how)

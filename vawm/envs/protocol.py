@@ -148,3 +148,19 @@ def check_environment(env: Any) -> None:
         "num_envs=...), if it is of Gymnasium"
     )
     raise InvalidInput("env", env, remedy)
+
+
+def check_fits(trained: EnvSpec, spec: EnvSpec) -> None:
+    """Refuses environments whose observations, actions or action repeat are not the policy's.
+
+    Args:
+      trained: of the environments that the policy was trained in.
+      spec: of the others.
+
+    Raises:
+      InvalidInput: names what differs.
+    """
+    for name in ("obs", "action_size", "discrete", "action_repeat"):
+        own, theirs = getattr(trained, name), getattr(spec, name)
+        if own != theirs:
+            raise InvalidInput("env", f"{name} {theirs}", f"the policy was trained with {own}")

@@ -30,8 +30,7 @@ def check_name(field: str, path: pathlib.Path) -> None:
     """Refuses the name of a film that is neither an MP4 nor a GIF.
 
     Raises:
-      InvalidInput: names the endings.
-      RunError: an MP4 needs a package that is not installed.
+      InvalidInput: names the endings, or the package that an MP4 needs.
     """
     if path.suffix not in (".mp4", ".gif"):
         raise InvalidInput(field, str(path), "use a name that ends with .mp4 or .gif")
@@ -43,7 +42,7 @@ def write(frames: np.ndarray, path: pathlib.Path) -> None:
     """Writes `[T, H, W, 3]` uint8 frames to what the name of the file says.
 
     Raises:
-      RunError: a package is not installed.
+      InvalidInput: a package is not installed.
       OSError: the file could not be written.
     """
     if path.suffix == ".gif":

@@ -14,7 +14,7 @@ import numpy as np
 from vawm.envs import EPISODE_STEPS, check_task, split
 from vawm.envs.host import rendering
 from vawm.envs.host.simulator import Outcome
-from vawm.envs.host.vision import USUAL, check_camera, to_actuator
+from vawm.envs.host.vision import USUAL, check_camera, outcome, repeat, to_actuator
 from vawm.envs.protocol import check_positive
 from vawm.types import PyTree, vector
 
@@ -70,18 +70,8 @@ class ProprioSimulator:
     def step(self, action: np.ndarray | int) -> Outcome:
         """Takes `action_repeat` control steps, fewer if the episode ends before."""
         control = to_actuator(action, self._low, self._high)
-        reward = 0.0
-        for _ in range(self._action_repeat):
-            latest = self._env.step(control)
-            reward += latest.reward
-            if latest.last():
-                break
-        return Outcome(
-            obs=flat(latest.observation),
-            reward=float(reward),
-            is_last=latest.last(),
-            is_terminal=bool(latest.discount == 0),
-        )
+        latest, reward = repeat(self._env, control, self._action_repeat)
+        return outcome(flat(latest.observation), latest, reward)
 
     def picture(self) -> np.ndarray:
         """The task as it is now, `[HEIGHT, WIDTH, 3]` uint8."""

@@ -108,18 +108,8 @@ class VisionSimulator:
           dm_control.rl.control.PhysicsError: the simulation diverged.
         """
         control = to_actuator(action, self._low, self._high)
-        reward = 0.0
-        for _ in range(self._action_repeat):
-            latest = self._env.step(control)
-            reward += latest.reward
-            if latest.last():
-                break
-        return Outcome(
-            obs=self._frame(),
-            reward=float(reward),
-            is_last=latest.last(),
-            is_terminal=bool(latest.discount == 0),
-        )
+        latest, reward = repeat(self._env, control, self._action_repeat)
+        return outcome(self._frame(), latest, reward)
 
     def picture(self) -> np.ndarray:
         """What the agent sees, but large: `[LARGE, LARGE, 3]` uint8."""
@@ -178,6 +168,22 @@ def check_camera(camera: int, domain: str, *, cameras: int) -> int:
         remedy = f"use one of {domain}'s cameras, 0 to {cameras - 1}, or -1 for the default"
         raise InvalidInput("env.camera", camera, remedy)
     return camera
+
+
+def repeat(env: Any, control: np.ndarray, times: int) -> tuple[Any, float]:
+    """Takes control steps until the episode ends: the last one, and the sum of rewards."""
+    reward = 0.0
+    for _ in range(times):
+        latest = env.step(control)
+        reward += latest.reward
+        if latest.last():
+            break
+    return latest, float(reward)
+
+
+def outcome(obs: np.ndarray, latest: Any, reward: float) -> Outcome:
+    """What a simulator says of dm_control's `latest` step."""
+    return Outcome(obs, reward, latest.last(), bool(latest.discount == 0))
 
 
 def to_actuator(action: np.ndarray | int, low: np.ndarray, high: np.ndarray) -> np.ndarray:

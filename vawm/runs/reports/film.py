@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -17,6 +17,7 @@ from PIL import Image, ImageDraw, ImageFont
 from vawm.agent import Agent, PolicyCarry
 from vawm.config import Config
 from vawm.envs.host.pool import Pool
+from vawm.envs.protocol import check_fits
 from vawm.learning.state import Learner
 from vawm.runs import suites
 from vawm.runs.reports.video import Video
@@ -102,10 +103,30 @@ def record(
         timestep = env.receive()
 
 
-def of_run(config: Config, agent: Agent, learner: Learner) -> Video:
-    """The film at the end of a run: the beginning of an episode of its policy.
+def play(
+    config: Config,
+    agent: Agent,
+    params: Params,
+    model_state: PyTree,
+    *,
+    seed: int,
+    steps: int,
+    python: str,
+    how: Literal["sample", "mode"] = "sample",
+    **changes: Any,
+) -> Film:
+    """`record` in an environment like those that a run was trained in.
 
-    It has random numbers of its own, so that the run has the same with and without it.
+    Args:
+      config: of the run.
+      agent: of it.
+      params: as in `record`, and so are the following, if not told otherwise.
+      model_state: of the world model.
+      seed: of the episode and of the actions.
+      steps: longest film.
+      python: what films environments of the caller's, for the remedy.
+      how: sample actions, or take the mode.
+      **changes: choices of the environments that differ from those of training.
 
     Raises:
       InvalidInput: its environments cannot be made again, or no renderer works here.
@@ -116,18 +137,38 @@ def of_run(config: Config, agent: Agent, learner: Learner) -> Video:
         dataclasses.replace(config, num_envs=1),
         agent.spec.made,
         task=agent.spec.task,
-        python="vawm.evaluate.filmed(vawm.load(LOGDIR))",
+        python=python,
         drawn=True,
+        **changes,
     )
     with contextlib.closing(env):  # type: ignore[type-var]
-        made = record(
+        check_fits(agent.spec, env.spec)
+        return record(
             agent,
-            learner.params,
-            learner.model_state,
+            params,
+            model_state,
             env,  # type: ignore[arg-type]
-            seed=SEED + config.seed,
-            steps=STEPS,
+            seed=seed,
+            steps=steps,
+            how=how,
         )
+
+
+def of_run(config: Config, agent: Agent, learner: Learner) -> Video:
+    """The film at the end of a run: the beginning of an episode of its policy.
+
+    It has random numbers of its own, so that the run has the same with and without it. Raises
+    what `play` does.
+    """
+    made = play(
+        config,
+        agent,
+        learner.params,
+        learner.model_state,
+        seed=SEED + config.seed,
+        steps=STEPS,
+        python="vawm.runs.reports.film.record(agent, params, model_state, env)",
+    )
     numbers = {"return": float(made.returns[-1]), "steps": len(made.returns) - 1}
     return Video("policy", frames(made), numbers | {"ended": made.ended})
 

@@ -90,9 +90,8 @@ def add(
         if is_count(name):
             counted[name] = counted.get(name, 0.0) + float(value)
         else:  # 0 updates add nothing
-            weighted[name] = weighted.get(name, 0.0) + (
-                updates * float(value) if updates else 0.0
-            )
+            chunk = updates * float(value) if updates else 0.0
+            weighted[name] = weighted.get(name, 0.0) + chunk
     return Interval(
         updates=interval.updates + updates,
         weighted=weighted,
