@@ -160,8 +160,8 @@ def on_files(files: Files, *, config: MkDocsConfig) -> Files:
         for picture in (OUTPUTS / notebook.stem).glob("*.png"):
             path = f"notebooks/{notebook.stem}/{picture.name}"
             add(path, abs_src_path=str(picture))
-    for result in RESULTS.iterdir():
-        path = f"results/files/{result.name}"
+    for result in filter(pathlib.Path.is_file, RESULTS.rglob("*")):
+        path = f"results/files/{result.relative_to(RESULTS).as_posix()}"
         level = InclusionLevel.NOT_IN_NAV
         add(path, abs_src_path=str(result), inclusion=level)
     return files
